@@ -88,7 +88,7 @@ lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its ow
 	python3.12 -m venv .venv-lerobot
 	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e . -e packages/lerobot \
 	  "lerobot[core-scripts]" pytest
-	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
+	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null --confcutdir packages/lerobot/tests/plugin \
 	  packages/lerobot/tests/plugin
 
 motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, minutes
@@ -106,7 +106,7 @@ outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, i
 
 siblings:  ## each sibling's tests with the core and that sibling alone, in an environment of its own, minutes
 	$(PYTHON) -m venv --clear $(ALONE)
-	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,osqp,piqp,onnx]" \
+	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,onnx]" \
 	  pytest pytest-xdist hypothesis psutil mpmath colorednoise rosbags ruckig ur-rtde
 	for sibling in $(SIBLINGS); do \
 	  required=""; [ $$sibling = calibration ] && required="-e packages/studies"; \

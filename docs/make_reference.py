@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic_core import PydanticUndefined
 
-from guiderail.models.common.plugins import is_sibling_module
+from guiderail.models.common.registry import is_sibling_module
 
 SECTION = re.compile(r"^(Args|Attributes|Raises|Returns|Yields):\s*(.*)$")
 ENTRY = re.compile(r"^(\*{0,2}[\w, /*]+):\s+(.*)$")
@@ -273,7 +273,13 @@ def api() -> str:
 
 
 def exported(name: str, thing: Any) -> str:
-    """Return the documentation of a class with its public methods, or of a function."""
+    """Return the documentation of a class with its public methods, or of a function.
+
+    A name of another package is only attributed to it: links of its documentation have no targets here.
+    """
+    package = thing.__module__.partition(".")[0]
+    if not package.startswith("guiderail"):
+        return f"From `{package}`.\n\n"
     page = documented(thing)
     if not inspect.isclass(thing):
         return signature(name, thing) + page
@@ -464,7 +470,7 @@ def shipped_templates() -> str:
 def templates() -> str:
     """Return the page of template files."""
     from guiderail.models.templates import schema
-    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 
     if changed := {*TEMPLATE_WORDS} ^ {*schema.TemplateFile.model_fields}:
         raise ValueError(f"the fields of a template changed: {changed} have no description here")
@@ -530,7 +536,7 @@ def workcells() -> str:
         )
     )
     page += table(["port", "size", "description"], rows)
-    tasks = {TASKS.get(name).station_kind().workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    tasks = {TASKS.get(name).station.kind.workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
         workcell = EnvConfig.resolve(task, {}).declared.workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
@@ -687,7 +693,7 @@ def wiring() -> str:
 
     from guiderail.diagrams.guidance import GUIDANCE, PlacedTemplate, PrimitiveConfig, PriorKnowledge, build_guidance
     from guiderail.diagrams.guidance.registry import missing_requirements
-    from guiderail.models.control.keep_out import KeepOut
+    from guiderail.models.control.command_filters import KeepOut
     from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
     from guiderail.models.templates import load_template
 

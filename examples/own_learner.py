@@ -3,15 +3,15 @@
 import numpy as np
 
 import guiderail as gr
-from guiderail.models.policy import FORMAT
 
 
 @gr.register_learner("hill_climbing")
 class HillClimbing(gr.Learner):
+    stored = ("best", "highest", "rng")
+
     def __init__(self, config, env, *, seed, **unused):
-        self.space, self.rng = env.action_space, np.random.default_rng(seed)
         self.best = np.zeros((env.action_space.shape[0], env.observation_space.shape[0] + 1))
-        self.highest, self.tried, self.score = -np.inf, self.best, 0.0
+        self.highest, self.rng = -np.inf, np.random.default_rng(seed)
 
     def on_episode_start(self):
         self.tried, self.score = self.best + 0.3 * self.rng.standard_normal(self.best.shape), 0.0
@@ -25,21 +25,9 @@ class HillClimbing(gr.Learner):
     def on_episode_end(self, row):
         if self.score > self.highest:
             self.best, self.highest = self.tried, self.score
-        return {}
 
     def policy(self, description):
-        limits = {"action_low": self.space.low.tolist(), "action_high": self.space.high.tolist()}
-        layer = (self.best[:, :-1].astype(np.float32), self.best[:, -1].astype(np.float32))
-        return gr.Policy([layer], {"format": FORMAT, **limits, **description})
-
-    def state(self):
-        return {"best": self.best}, {"highest": self.highest, "random": self.rng.bit_generator.state}
-
-    def restore(self, arrays, values):
-        self.best, self.highest, self.rng.bit_generator.state = arrays["best"], values["highest"], values["random"]
-
-    def has_diverged(self):
-        return not np.isfinite(self.best).all()
+        return gr.Policy([(self.best[:, :-1], self.best[:, -1])], description)
 
 
 if __name__ == "__main__":

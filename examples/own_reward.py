@@ -3,7 +3,7 @@
 import numpy as np
 
 import guiderail as gr
-from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
+from guiderail.diagrams.tasks.grid_clamp import GridClamp
 
 
 @gr.register_task("examples/TimeCost")

@@ -48,7 +48,10 @@ class Policy:
         description: Mapping[str, Any],
         encoder: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ):
-        self._layers, self._encoder = list(layers), list(encoder)
+        self._layers, self._encoder = (
+            [(np.asarray(weight, np.float32), np.asarray(bias, np.float32)) for weight, bias in each]
+            for each in (layers, encoder)
+        )
         self.description = dict(description)
         activation = self.description.setdefault("activation", "relu")
         if activation not in ("relu", "normalized_relu", "tanh"):

@@ -23,7 +23,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.episode import Callback, Transition
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.learner import described_observation, learner_arguments
+from guiderail.tools.learning.learner import describe_interface, learner_arguments
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
 from guiderail.tools.learning.run_folder import RunConfig, configure
 from guiderail.tools.tables import read_table, write_table
@@ -95,7 +95,7 @@ def train_both(out: Path, episodes: int, refinement: int, seed: int) -> None:
     envs: list[Any] = [make_environment(TASK, config.environment) for config in configs]
     try:
         teacher, student = (make_learner(*each) for each in zip(configs, envs, strict=True))
-        description = {"task": TASK, **described_observation(envs[0])}
+        description = {"task": TASK, **describe_interface(envs[0])}
         copied, rows = TaskSpaceTransitions(envs[0], student, STUDENT), []
         for env in envs:
             env.reset(seed=seed)

@@ -1,4 +1,4 @@
-"""Learner with automatic interventions from one demonstration, after AutoSERL (docs/experiments.md).
+"""Learner with automatic interventions from one demonstration, after AutoSERL (research/experiments.md).
 
 Y. Liu et al., "One Demonstration Is Enough for Real-World Robotic Reinforcement Learning", arXiv 2607.01651. There, the
 robot is guided to the nearest point in a sliding window of the demonstration if this point lies ahead. If the robot is

@@ -1,8 +1,8 @@
-"""Base policy of the study `connector_hard_base_policy`: a search that sometimes succeeds (docs/experiments.md)."""
+"""Base policy of the study `connector_hard_base_policy`: a search that sometimes succeeds (research/experiments.md)."""
 
 import numpy as np
 
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks.bnc_connector import (
     CENTER_OF_PRESSURE,
     COMMAND,
     HOLD_UNTIL,

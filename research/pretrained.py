@@ -2,7 +2,8 @@
 
     python -m research.pretrained [NAME...] [--out runs/pretrained] [--episodes 40]
 
-The policies of contact tasks are learned at `difficulty="hard"` on the arm with the sensors of a robot. Every policy
+The policies of contact tasks are learned at `difficulty="hard"` on the arm: the clamp with the sensors of a robot, the
+connector with a force-torque sensor at the wrist, because joint torques do not show the side of its rim. Every policy
 and the baseline policies of its task are evaluated on 40 held-out episodes. The policy's configuration, weights and
 evaluation are written to `tools/pretrained/NAME`. An interrupted training is resumed.
 """
@@ -32,8 +33,8 @@ POLICIES: dict[str, dict[str, Any]] = {
         },
     },
     "connector": {
-        "task": "BncConnector", "guidance": "kgrl", "episodes": 180, "seed": 2200002, **ARM,
-        "demonstrations": "firm_search", "settings": {"symmetry": "near", "privileged_critic": True},
+        "task": "BncConnector", "guidance": "kgrl", "episodes": 120, "seed": 3000001, **ARM, "sensing": "wrist",
+        "disturbances.friction_factor": (0.5, 2.0), "settings": {"symmetry": "near", "privileged_critic": True},
     },
     "clamp": {
         "task": "GridClamp", "guidance": "sct", "episodes": 60, "seed": 2300001, **ARM, "fixture_offset": "per_run",
@@ -45,7 +46,7 @@ POLICIES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,
-grid_clamp_robot_sensing and pouring_hard_shield, and the second one of connector_robot_sensing."""
+grid_clamp_robot_sensing and pouring_hard_shield, and of `research.engines`."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
 MAX_SIZE = 200_000  # largest total size of the files of one policy [bytes]
 EPISODES = 40  # held-out episodes of the policy and of each baseline policy

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.diagrams.tasks.insertion import MAX_GIVEN_OFFSET
 from guiderail.diagrams.tasks.options import HISTORY_VARIANCE
 from guiderail.models.common.errors import InputError

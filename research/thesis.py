@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig
 

@@ -16,9 +16,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.differentiable_impedance import differentiable_torques, values_of
 from guiderail.systems.support.drake_multibody import (
     check_plant,
     effort_limits,
@@ -26,8 +24,8 @@ from guiderail.systems.support.drake_multibody import (
     pose_to_transform,
     transform_to_pose,
 )
-from guiderail.systems.support.last_valid_bound import LastValidBound
-from guiderail.systems.support.last_valid_pose import LastValidPose
+from guiderail.systems.support.last_valid import CommandValidity, LastValidBound, LastValidPose
+from guiderail.systems.support.scalar_conversion import ConvertibleSystem, differentiable_torques, values_of
 
 MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; above it, wrenches could overflow
 
@@ -37,14 +35,15 @@ class ImpedanceGains:
     """Stiffness, damping and limits of a Cartesian impedance, and its null-space posture.
 
     Args:
-        stiffness: Stiffness matrix (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
-        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive and finite.
+        stiffness: Stiffness matrix (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad,
+            along the axes of the target frame T.
+        wrench_limits: Limits (6,) of the wrench along these axes [N, Nm], positive and finite.
         damping_ratio: Damping ratio of every mode, positive and finite.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
         posture_damping: Decay rate of null-space motion [1/s], not negative, finite. Its torque is this rate times M v,
             which dissipates energy in every posture.
-        bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
+        bound: Bound of the wrench along these axes; None: `wrench_limits`.
 
     Raises:
         InputError: If an argument is out of range or of another shape.
@@ -109,7 +108,7 @@ class CartesianImpedanceController(ConvertibleSystem):
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
     J is the Jacobian of P, e the pose error, V the velocity of P and N the projector into the null space; see
-    `impedance_torques`. The axes of K are those of `stiffness_frame`. The orientation error is computed from
+    `impedance_torques`. The axes of K are those of T. The orientation error is computed from
     quaternions, so no orientation is singular. The damping D is computed from K and the arm's inertia in its present
     posture. While no valid command is available, the last valid command is followed (`LastValidPose`).
 
@@ -138,8 +137,6 @@ class CartesianImpedanceController(ConvertibleSystem):
         tool_center: Frame P.
         gains: Impedance parameters.
         period: Period of the command check [s], positive.
-        stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the impedance is
-            not strictly passive, because a rotation of the axes of a loaded spring can add energy.
         compensate_gravity: False if the controller of the robot compensates gravity already.
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
@@ -157,15 +154,13 @@ class CartesianImpedanceController(ConvertibleSystem):
         gains: ImpedanceGains,
         *,
         period: float,
-        stiffness_frame: Frame | None = None,
         compensate_gravity: bool = True,
         timeout: float = 0.1,
     ):
         super().__init__()
-        check_plant(plant, target, target=target, tool_center=tool_center, stiffness_frame=stiffness_frame or target)
+        check_plant(plant, target, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
-        self._stiffness_frame = stiffness_frame
         self._default_parameters = [*_to_numbers(gains), np.zeros(4)]
         self._parameters = [self.DeclareNumericParameter(BasicVector(numbers)) for numbers in self._default_parameters]
         self._tuning = declare.cache(self, "gains_and_payload", self._calc_tuning, [self.all_parameters_ticket()])
@@ -175,9 +170,8 @@ class CartesianImpedanceController(ConvertibleSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._followed_pose = LastValidPose(
-            self, self._desired_pose_port, self._command_time_port, self._pose, period=period, timeout=timeout
-        )
+        validity = CommandValidity(self._command_time_port, period=period, timeout=timeout)
+        self._followed_pose = LastValidPose(self, self._desired_pose_port, validity, self._pose)
 
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
         self._plant_context = declare.plant_context(
@@ -267,10 +261,6 @@ class CartesianImpedanceController(ConvertibleSystem):
         frames = (self._tool_center, self._target)
         tool_center, target = (plant.get_frame(frame.index()) for frame in frames)
         X_TP = tool_center.CalcPose(plant_context, target)
-        R_TAxes = None
-        if self._stiffness_frame is not None:
-            axes = plant.get_frame(self._stiffness_frame.index())
-            R_TAxes = axes.CalcPose(plant_context, target).rotation().matrix()
         eta, epsilon = orientation_error(X_TPd.rotation(), X_TP.rotation())
         J = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, tool_center, np.zeros(3), target, target
@@ -293,7 +283,6 @@ class CartesianImpedanceController(ConvertibleSystem):
             K=gains.stiffness,
             damping_ratio=gains.damping_ratio,
             wrench_limits=gains.wrench_limits,
-            R_axes=R_TAxes,
             p_error=X_TPd.translation() - X_TP.translation(),
             eta=eta,
             epsilon=epsilon,

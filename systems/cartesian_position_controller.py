@@ -13,13 +13,16 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number, as_numbers, norm
+from guiderail.models.common.arrays import as_numbers, norm
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant, pose_to_transform, transform_to_pose
-from guiderail.systems.support.last_valid_pose import CommandValidity
+from guiderail.systems.support.last_valid import CommandValidity
+
+POSTURE_GAIN = 0.5  # gain of the return to the posture [1/s]
+TIMEOUT = 0.1  # age above which a desired pose is stale [s]
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class CartesianPositionController(LeafSystem):
     moves in the direction of V. If both are not possible at the speed of V, the tool slows down or stops. A joint that
     starts outside its position limits does not move farther out; it may return within its velocity limit.
 
-    While the desired pose is not finite, older than the timeout, or more than one period in the future
+    While the desired pose is not finite, older than 0.1 s, or more than one period in the future
     (`CommandValidity`), the joint command is constant. Near a singular posture, a damped pseudoinverse is used
     (`models.control.damped_inverse`). The joint velocities then stay small, the direction of the tool deviates
     slightly from V, and null-space control moves the arm out of the singularity.
@@ -72,8 +75,6 @@ class CartesianPositionController(LeafSystem):
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         period: Period of the joint commands [s], positive.
         speed_limits: Speed limits of the tool center.
-        posture_gain: Gain of the return to the posture [1/s], not negative, finite.
-        timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
         InputError: If an argument is out of range. At initialization, if a measured position is not finite.
@@ -88,33 +89,29 @@ class CartesianPositionController(LeafSystem):
         posture: np.ndarray,
         period: float = 0.01,
         speed_limits: SpeedLimits = SpeedLimits(),
-        posture_gain: float = 0.5,
-        timeout: float = 0.1,
     ):
         super().__init__()
         check_plant(plant, target, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         if num_joints < 6:
             raise InputError(f"a position controller needs an arm of at least six joints, not {num_joints}")
-        if not 0.0 <= as_number(posture_gain, "posture_gain") < np.inf:
-            raise InputError(f"a position controller's posture gain must not be negative, not {posture_gain}")
         if not np.isfinite(posture).all():
             raise InputError(f"a position controller's posture must be finite joint positions, not {posture}")
         self._plant, self._target, self._tool_center = plant, target, tool_center
         self._period, self._speed_limits = period, speed_limits
-        self._posture, self._posture_gain = as_numbers(posture, "posture"), posture_gain
+        self._posture = as_numbers(posture, "posture")
         self._position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         self._velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
         self._parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)
         self._parameters.set_time_step(period)
         self._parameters.set_nominal_joint_position(self._posture)
-        self._parameters.set_joint_centering_gain(posture_gain * np.eye(num_joints))
+        self._parameters.set_joint_centering_gain(POSTURE_GAIN * np.eye(num_joints))
         self._parameters.set_joint_velocity_limits(self._velocity_limits)
 
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._validity = CommandValidity(self._command_time_port, period=period, timeout=timeout)
+        self._validity = CommandValidity(self._command_time_port, period=period, timeout=TIMEOUT)
         self._command = declare.unset_state(self, num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
         self._has_timed_out = self.DeclareDiscreteState(1)
@@ -178,7 +175,7 @@ class CartesianPositionController(LeafSystem):
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray | None, bool]:
         """Return the joint velocities for a tool velocity V, or None on failure, and True if V cannot be followed."""
-        velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
+        velocities, is_regular = damped_joint_velocities(J, V, POSTURE_GAIN * (self._posture - q))
         if not is_regular:
             lower, upper = self._velocity_limits
             velocities /= max(1.0, float(np.maximum(velocities / lower, velocities / upper).max()))

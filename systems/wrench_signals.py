@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from guiderail.models.common.arrays import is_finite, norm
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
-from guiderail.models.control.wrench import center_of_pressure
+from guiderail.models.control.wrench import ContactPointMean, center_of_pressure
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
@@ -110,8 +110,7 @@ class CenterOfPressure(LeafSystem):
 
     def __init__(self, min_force: float):
         super().__init__()
-        if not 0.0 < min_force < np.inf:
-            raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
+        _check_min_force(min_force)
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         declare.output(
             self,
@@ -123,6 +122,65 @@ class CenterOfPressure(LeafSystem):
 
     get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
     get_center_of_pressure_output_port = output_getter("center_of_pressure", "center of pressure, (2,) [m]")
+
+
+class MeanContactPoint(LeafSystem):
+    """Average the points of contact of a tool on a fixed surface, relative to the tool center (`ContactPointMean`).
+
+        n' = min(n + 1, τ / h),  m' = m + (p + c − m) / n'   if f_z ≥ min_force, otherwise unchanged
+        mean_contact_point = m − p if n > 0, otherwise 0
+
+    p is the tool's position in x and y, c its center of pressure (`CenterOfPressure`), and h the period.
+
+    ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
+    finite are skipped. ``mean_contact_point`` is (2,), x and y [m], in the axes of T.
+
+    Args:
+        min_force: Force along z below which a sample is not used [N], positive and finite.
+        period: Control period h [s], positive.
+        time_constant: Time τ over which points are averaged [s], finite, at least the period.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, min_force: float, *, period: float, time_constant: float):
+        super().__init__()
+        _check_min_force(min_force)
+        if not period <= time_constant < np.inf:
+            raise InputError(f"a mean of contact points needs a time of at least {period} s, not {time_constant} s")
+        self._min_force, self._largest = min_force, time_constant / period
+        self._mean, self._count = self.DeclareDiscreteState(2), self.DeclareDiscreteState(1)
+        self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
+        self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
+        sources = [self._pose_port, self._mean, self._count]
+        declare.output(
+            self,
+            "mean_contact_point",
+            2,
+            lambda context: self._stored(context).relative_to(self._pose_port.Eval(context)),
+            sources,
+        )
+        declare.update(self, period, self._update, declare.reset_to_default(self))
+
+    get_pose_input_port = input_getter("pose", "pose of the tool, (6,)")
+    get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
+    get_mean_contact_point_output_port = output_getter("mean_contact_point", "mean point of contact, (2,) [m]")
+
+    def _stored(self, context: Context) -> ContactPointMean:
+        state = context.get_discrete_state()
+        return ContactPointMean(self._min_force, self._largest, state.value(self._mean), state.value(self._count)[0])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        stored = self._stored(context)
+        stored.add(self._pose_port.Eval(context), self._wrench_port.Eval(context))
+        discrete_state.set_value(self._mean, stored.mean)
+        discrete_state.set_value(self._count, [stored.count])
+
+
+def _check_min_force(min_force: float) -> None:
+    if not 0.0 < min_force < np.inf:
+        raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
 
 
 class ForceMonitor(LeafSystem):

@@ -27,8 +27,7 @@ from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import find_plugins
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.registry import Registry, find_plugins
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS, find_end_effector, find_robot
 from guiderail.tools.environments import task_options

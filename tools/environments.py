@@ -17,16 +17,12 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.spaces import Box
 
 from guiderail.diagrams.envs.options import (
-    CommonOptions,
     Options,
-    PrimitiveOptions,
-    TemplateOptions,
     flat_options,
     kernel_from_options,
     option_fields,
     validate_options,
 )
-from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
     TASKS,
@@ -37,8 +33,7 @@ from guiderail.diagrams.tasks.registry import (
 )
 from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import find_plugins
-from guiderail.models.common.registry import did_you_mean, find_class
+from guiderail.models.common.registry import did_you_mean
 
 _LOGGER = logging.getLogger(__name__)
 _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder
@@ -115,20 +110,9 @@ def resolve_environment(task: str, arguments: Mapping[str, Any]) -> Any:
     return {name: value for name, value in values.items() if value is not inspect.Parameter.empty}
 
 
-def declared_models(task: str) -> list[type[Options]]:
-    """Return the pydantic models of all options that a registered task may have, with any guidance and station.
-
-    Options of guidance and stations whose package declares no plug-in for them are missing.
-    """
-    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS)]
-    models += [PrimitiveOptions, TemplateOptions, Disturbances]
-    models += [point.load() for kind in ("station_options", "guidance_options") for _, point in find_plugins(kind)]
-    return list(dict.fromkeys(models))
-
-
 def flat_environment(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a task's environment with entries of structured options as options; see `flat_options`."""
-    return flat_options(declared_models(task), options) if task in TASKS.names() else dict(options)
+    return flat_options(options, TASKS.get(task).model_fields) if task in TASKS.names() else dict(options)
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
@@ -143,14 +127,14 @@ def warn_of_deviation(config: Any) -> None:
     The motion deviates if less than the fraction `MIN_SHARE` of its steps lies within a standard deviation of the
     demonstrations.
     """
-    from guiderail.models.primitives.fit import MIN_SHARE, estimated_share  # imports SciPy, which takes a second
+    from guiderail.models.primitives.fit import MIN_SHARE, share_within_spread  # imports SciPy, which takes a second
 
     reference = config.reference()
     if reference is None:
         return
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
-    share = estimated_share(reference, kernel_from_options(values), **chosen)
+    share = share_within_spread(reference, kernel_from_options(values), **chosen)
     if share < MIN_SHARE:
         _LOGGER.warning(
             "without actions, %.0f%% of the steps stay within a standard deviation of the demonstrations: let "

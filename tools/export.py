@@ -19,7 +19,7 @@ from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
-from guiderail.models.laws.skill import PRIMITIVE_FILE, SKILL_FILE
+from guiderail.models.laws.primitive import PRIMITIVE_FILE, SKILL_FILE
 from guiderail.models.policy import Ensemble, Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
 from guiderail.tools.evaluation.subject import refuse_guidance_change
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 WRENCH_NAMES = ("Fx [N]", "Fy [N]", "Fz [N]", "Mx [Nm]", "My [Nm]", "Mz [Nm]")
 NAMES = {"time": ("time [s]",), "phase": ("phase",), "state": ("state",), "wrench": WRENCH_NAMES}
 NAMES["center_of_pressure"] = ("center of pressure x [m]", "center of pressure y [m]")
+NAMES["mean_contact_point"] = ("mean contact point x [m]", "mean contact point y [m]")
 NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in ("pose", "desired_pose")}
 """Names of a signal's entries with their units; entries of another signal are numbered."""
 EXPORTED = {"kernel": DEFAULT_KERNEL, "history.source": "commanded", "history.adaptive": False}
@@ -258,8 +259,9 @@ def policy_to_onnx(policy: Policy) -> bytes:
         nodes.append(("Tanh" if description["activation"] == "tanh" else "Relu", (value,), f"hidden_{index}"))
         value = f"hidden_{index}"
     low, high = (np.asarray(description[f"action_{end}"], np.float32) for end in ("low", "high"))
-    tensors |= {"low": low, "high": high}
+    tensors["low"] = low
     if description.get("squash", "tanh") == "clip":
+        tensors["high"] = high
         nodes += [("Max", (value, "low"), "above"), ("Min", ("above", "high"), "action")]
     else:
         tensors |= {"half": np.float32(0.5) * (high - low), "one": np.ones(1, np.float32)}

@@ -80,12 +80,16 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
         raise InputError(f"{file} and the files before it have more than {max_rows} rows: read fewer files")
 
 
-def write_table(path: Path, rows: Rows) -> Path:
-    """Write rows as CSV and Markdown, with the endings .csv and .md appended to `path`; return the Markdown file."""
+def write_table(path: Path, rows: Rows, summary: Rows | None = None) -> Path:
+    """Write rows as CSV and Markdown, with the endings .csv and .md appended to `path`; return the Markdown file.
+
+    With a `summary` the Markdown file has its rows instead.
+    """
     table = pd.DataFrame(rows, dtype=object)
     # Not `with_suffix`, which would replace a part of a name such as "bound-0.5".
     csv_file, markdown_file = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.md")
     write_atomically(csv_file, table_text(table).encode())
+    table = table if summary is None else pd.DataFrame(summary, dtype=object)
     lines = [[name.replace("_", " ") for name in table], ["---"] * len(table.columns)]
     lines += [[cell(value).replace("|", "\\|") for value in row] for row in table.itertuples(index=False)]
     write_atomically(markdown_file, "".join(f"| {' | '.join(line)} |\n" for line in lines).encode())

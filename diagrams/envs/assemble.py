@@ -25,8 +25,8 @@ from guiderail.diagrams.envs.observation import (
 )
 from guiderail.diagrams.envs.options import PrimitiveOptions, validate_options
 from guiderail.diagrams.envs.scene import (
+    add_camera,
     add_meshcat,
-    add_observation_camera,
     add_picture,
     contact_results_of,
     scene_of,
@@ -35,20 +35,18 @@ from guiderail.diagrams.envs.task_diagram import Symmetry, TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PlacedTemplate, PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
-from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Condition, Threshold, World, signals_of
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.kernels import make_kernel
 from guiderail.models.primitives.reference import pass_through
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
-from guiderail.systems.reward_system import RewardSystem, RewardTerm
+from guiderail.systems.command_checks import ConstraintViolation
+from guiderail.systems.episode_terms import EpisodeMonitor, RewardSystem, RewardTerm, TerminationTerm
 
 
 def build_prior_knowledge(config: EnvConfig, station: Station) -> PriorKnowledge:
@@ -101,11 +99,10 @@ def template_of(config: EnvConfig) -> PlacedTemplate | None:
 
 
 _LIMITS = ("max_speed", "max_acceleration")
-_JOINTS = ("joint_margin", "min_singular_value")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
 _CONVERTED_OPTIONS = (
-    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag", *_LIMITS,
-    *_JOINTS,
+    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag",
+    "joint_margin", *_LIMITS,
 )  # fmt: skip
 
 
@@ -130,9 +127,7 @@ def _motion_constraints(
     """Return a task's motion constraints, extended by the limits in its options; None if there are neither."""
     limits: dict[str, Any] = {}
     if options["joint_margin"] is not None:
-        limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    elif options["min_singular_value"]:
-        raise InputError("min_singular_value has an effect with joint_margin only: give joint_margin=0 as well")
+        limits["state"] = [station.joint_range(options["joint_margin"])]
     outputs = constraints.num_outputs
     limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options[name]}
     if motion is None:
@@ -265,10 +260,10 @@ class Loop:
         camera, terms = self.observed.camera, self.observed.terms
         if camera is None:
             return self.add_terms(terms, "observation")
-        image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
+        image, (width, height) = add_camera(self.builder, self.station, "observation_camera", camera), camera.size
         if not terms:
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        from guiderail.systems.image_observation import ImageObservation  # most environments have no image
+        from guiderail.systems.policy_system import ImageObservation  # most environments have no image
 
         space, state = self.add_terms(terms, "state_observation")
         combined = ImageObservation(width, height, state.size())
@@ -282,7 +277,6 @@ class Loop:
             InputError: If a term names a signal that does not exist, or as `Observation`.
         """
         task, user = self.task, f"the {name} of {self.task.name}"
-        check_terms(terms, task.name)
         names = [term.signal for term in terms if term.signal not in CLOCKS]
         ports = {signal: self.signals.get(signal, user) for signal in names}
         duration = self.config.num_steps * self.station.control_period
@@ -298,7 +292,6 @@ class Loop:
         """Add the monitor of the task's terminations."""
         task, user = self.task, f"the termination of {self.task.name}"
         conditions = task.done()
-        check_functions(conditions, "done", task.name)
         terms = []
         for reason, given in conditions.items():
             condition = given if isinstance(given, Condition) else Condition(given)
@@ -315,7 +308,6 @@ class Loop:
         """Add the sum of the task's reward terms."""
         task, user = self.task, f"reward {self.task.reward!r} of {self.task.name}"
         functions = task.rewards()
-        check_functions(functions, "rewards", task.name)
         repeat = ConstantVectorSource([float(self.config.action_repeat)])
         if any("action_repeat" in signals_of(function, user) for function in functions.values()):
             source = self.builder.AddNamedSystem("action_repeat", repeat)
@@ -519,20 +511,15 @@ def _add_violations(
 def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagram: Diagram) -> Any:
     """Return the function `TaskDiagram.randomize` of a root diagram, with hidden values of a run of its own.
 
-    The returned function raises an `InputError` if a reset option is invalid, or if the task's `reset` does not return
-    values by name or returns a value with a reserved name.
+    The returned function raises an `InputError` if a reset option is invalid, or the task's `reset` returns a value
+    with a reserved name.
     """
     task = config.declared
     run: dict[str, Any] = {}
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         given = validate_options(task.Reset, options, f"a reset of {task.name}")
-        returned = task.reset(World(station, guidance, diagram, context, run), rng, given)
-        sampled = {} if returned is None else returned
-        if not isinstance(sampled, Mapping):
-            raise InputError(
-                f"reset of {task.name} must return the sampled values by name, or nothing, not {brief(sampled)}"
-            )
+        sampled = task.reset(World(station, guidance, diagram, context, run), rng, given) or {}
         if reserved := [name for name in sampled if name in INFO_KEYS]:
             raise InputError(
                 f"reset of {task.name} returns a value named {reserved[0]!r}, which is reserved: give it another name"
@@ -554,42 +541,6 @@ def _push(station: Station) -> Any:
 
 # Smallest distance of demonstrated angles from ±180° [rad], because actions and contact turn the tool further.
 HALF_TURN_MARGIN = 0.1
-
-
-# Attributes that a workcell must have, by its kind; workcells of other kinds are not checked.
-_WORKCELL_ATTRIBUTES = {
-    "insertion": ("X_WT", "add_fixture", "add_workpiece", "filter_contacts"),
-    "plane": ("robot_radius", "walls", "goal", "goal_radius", "zone_x", "obstacle", "obstacles", "obstacles_move"),
-    "pouring": ("X_WT", "mug", "ball", "num_balls", "plant_period", "control_period"),
-}
-
-
-def check_workcell(workcell: Any, kind: StationKind, task: str) -> None:
-    """Check that the workcell of a task has the attributes that stations of a `kind` need.
-
-    Raises:
-        InputError: If there is no workcell, or it lacks an attribute.
-    """
-    if workcell is None:
-        raise InputError(f"workcell() of {task} returns nothing: let it return what station={kind.name!r} works on")
-    missing = [name for name in _WORKCELL_ATTRIBUTES.get(kind.workcell_kind, ()) if not hasattr(workcell, name)]
-    if missing:
-        raise InputError(
-            f"workcell() of {task} returns {brief(workcell)}, which has no {missing[0]}: let it return what "
-            f"station={kind.name!r} works on"
-        )
-
-
-def check_terms(terms: Any, task: str) -> None:
-    """Raise an `InputError` unless the observation of a task is a list of `ObservationTerm`."""
-    if not isinstance(terms, list | tuple) or not all(isinstance(term, ObservationTerm) for term in terms):
-        raise InputError(f"observe() of {task} must return Observed or a list of ObservationTerm, not {brief(terms)}")
-
-
-def check_functions(functions: Any, method: str, task: str) -> None:
-    """Raise an `InputError` unless a `method` of a task returns functions by name."""
-    if not isinstance(functions, Mapping):
-        raise InputError(f"{method}() of {task} must return functions of signals by name, not {brief(functions)}")
 
 
 def turns_near_half(means: np.ndarray) -> bool:

@@ -18,6 +18,7 @@ from guiderail.diagrams.envs.options import (
     check_choice,
     flat_options,
     option_fields,
+    validate_options,
     validate_tree,
 )
 from guiderail.diagrams.guidance.prior import Prior
@@ -29,7 +30,7 @@ from guiderail.diagrams.guidance.registry import (
     possible_guidance,
 )
 from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
+from guiderail.diagrams.stations.registry import STATIONS, StationKind, kind_of, stations_for
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, whole_multiple
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Task
@@ -162,12 +163,17 @@ def on_clock(reference: ReferenceTrajectory, period: float) -> ReferenceTrajecto
 
 def stations_of(task: type[Task]) -> list[str]:
     """Return the names of the stations that a task supports."""
-    return [name for name in stations_for(task.station_kind().workcell_kind) if task.supports(name)]
+    return [name for name in stations_for(station_kind_of(task).workcell_kind) if task.supports(name)]
+
+
+def station_kind_of(task: type[Task]) -> StationKind:
+    """Return the registered kind of a task's default station."""
+    return kind_of(task.station, task.name)
 
 
 def prior_of(task: type[Task]) -> Prior:
     """Return the prior knowledge that a task declares with its default options."""
-    return task.model_validate({}).prior()
+    return validate_options(task, {}, task.name).prior()
 
 
 def option_models(
@@ -187,7 +193,7 @@ def option_models(
         "primitive": PrimitiveOptions if "demonstrations" in provides else Options,
         "template": TemplateOptions if "template" in provides else Options,
         "guidance": kind.options or Options,
-        "disturbances": Disturbances if task.station_kind().workcell_kind == "insertion" else Options,
+        "disturbances": Disturbances if station_kind_of(task).workcell_kind == "insertion" else Options,
     }
 
 
@@ -197,7 +203,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(presets), name)
     settings = task.defaults, presets[difficulty], options
     provides = prior_of(task).provides
-    chosen = {"station": task.station_kind().name}
+    chosen = {"station": station_kind_of(task).name}
     for given in settings:
         chosen |= {key: given[key] for key in ("guidance", "station") if key in given}
     if "guidance" not in chosen:
@@ -209,12 +215,11 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     models = option_models(task, chosen["guidance"], chosen["station"], provides)
     known = {option for model in models.values() for option in option_fields(model)}
     _check_declared_options(task, provides, known)
-    defaults, preset, options = (flat_options(models.values(), given) for given in settings)
+    defaults, preset, options = (flat_options(given, task.model_fields) for given in settings)
     _check_given_options(task, options, known)
     parts: dict[str, Any] = dict(validate_tree(models, {**defaults, **preset, **options, **chosen}, name))
     common = parts.pop("common")
     config = EnvConfig(name, **{option: getattr(common, option) for option in CommonOptions.model_fields}, parts=parts)
-    config.declared.check()
     _ = config.period  # refuses a control period that is no multiple of the station's time unit
     return config
 
@@ -222,7 +227,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
 def _check_station(task: type[Task], name: Any) -> None:
     """Raise an InputError unless the task supports a station; only this station is imported if it does."""
     is_known = isinstance(name, str) and name in STATIONS.names() and task.supports(name)
-    if not is_known or STATIONS.get(name).workcell_kind != task.station_kind().workcell_kind:
+    if not is_known or STATIONS.get(name).workcell_kind != station_kind_of(task).workcell_kind:
         check_choice("station", name, stations_of(task), task.name)
 
 

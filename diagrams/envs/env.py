@@ -19,7 +19,7 @@ from pydrake.systems.framework import Context, Diagram, PortDataType
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
-from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.termination import TERMINATIONS, Termination
 
@@ -141,10 +141,8 @@ class DiagramEnv(DrakeGymEnv):
             release: Function that is called once, when the environment is closed or garbage-collected.
 
         Raises:
-            InputError: If `action_repeat` is not a positive integer, or the task cannot be rendered in this mode.
+            InputError: If the task cannot be rendered in this mode.
         """
-        if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
-            raise InputError(f"action_repeat must be a whole number of control steps, at least 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
         view = (
@@ -231,12 +229,7 @@ class DiagramEnv(DrakeGymEnv):
                 puts the robot more than `MAX_POSITION` away, or the observation is not finite although the simulation
                 did not fail.
         """
-        if self._closed:
-            raise InputError("the environment is closed: make another one")
-        if options is not None and not isinstance(options, Mapping):
-            raise InputError(
-                f"the options of a reset are values by name, such as {{'held_out': True}}, not {brief(options)}"
-            )
+        self._check_open()
         # The parent class's reset would initialize the simulator before the state is set, and accepts no options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
@@ -256,8 +249,7 @@ class DiagramEnv(DrakeGymEnv):
             ResetNeeded: If no episode has begun.
             InputError: If the environment is closed.
         """
-        if self._closed:
-            raise InputError("the environment is closed: make another one")
+        self._check_open()
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
         context = self._pristine.Clone()  # without the values in the caches, which are computed again
@@ -278,12 +270,9 @@ class DiagramEnv(DrakeGymEnv):
         equal as well, because the state includes the random generator.
 
         Raises:
-            InputError: If `state` is none of `save`, or belongs to another diagram; or if the environment is closed.
+            InputError: If `state` belongs to another diagram, or the environment is closed.
         """
-        if self._closed:
-            raise InputError("the environment is closed: make another one")
-        if not isinstance(state, EpisodeState):
-            raise InputError(f"an episode is restored from what save() returned, not from {brief(state)}")
+        self._check_open()
         if state.diagram is not self.diagram.diagram:
             raise InputError("this state was saved by an environment with another diagram: save it in this one")
         self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(state.context)
@@ -296,6 +285,10 @@ class DiagramEnv(DrakeGymEnv):
             setattr(self, name, value)
         assert self._observation is not None
         return self._observation
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError("the environment is closed: make another one")
 
     def _begin_episode(self) -> tuple[np.ndarray | None, dict[str, Any]]:
         """Return observation and info of a reset, after the simulator was initialized or has failed."""
@@ -314,9 +307,7 @@ class DiagramEnv(DrakeGymEnv):
                 now = {name: port.Eval(context) for name, port in self._recorded}
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
-        info = self._info(
-            0, *self._violations, self._forces(0.0, 0.0), 0.0, False, dict.fromkeys(self.diagram.reward_terms, 0.0)
-        )
+        info = self._info(0, 0, dict.fromkeys(self.diagram.reward_terms, 0.0))
         return self._observation, info | self.sampled
 
     @contextmanager
@@ -367,10 +358,7 @@ class DiagramEnv(DrakeGymEnv):
         context = self.simulator.get_context()
         self._action_value.GetMutableData().set_value(action)
 
-        total = peak_force = peak_contact_force = 0.0
-        commanded_violation = measured_violation = -np.inf
-        terms = dict.fromkeys(self.diagram.reward_terms, 0.0)
-        termination, fallback = 0, False
+        total, termination, terms = 0.0, 0, dict.fromkeys(self.diagram.reward_terms, 0.0)
         first_step, last_step = (
             self._control_steps,
             min(self._control_steps + self.action_repeat, self.diagram.num_steps),
@@ -392,12 +380,6 @@ class DiagramEnv(DrakeGymEnv):
                 break  # this control step is dropped
             self._control_steps += 1
             total += reward
-            # The built-in max would ignore NaN, and an unknown violation would be reported as slack.
-            peak_force = float(np.maximum(peak_force, force))
-            peak_contact_force = float(np.maximum(peak_contact_force, now["contact_force"][0]))
-            commanded_violation = float(np.maximum(commanded_violation, now["commanded_violation"][0]))
-            measured_violation = float(np.maximum(measured_violation, now["measured_violation"][0]))
-            fallback = fallback or bool(now["fallback"][0])
             for name, value in gained:
                 terms[name] += value
             self.trace.append(desired_pose, pose, force, reward, now)
@@ -409,13 +391,7 @@ class DiagramEnv(DrakeGymEnv):
         truncated = not terminated and (self._failure is not None or self._control_steps >= self.diagram.num_steps)
         if truncated and self._failure is None:
             termination = Termination.TIME_LIMIT.index
-        if self._control_steps == first_step:
-            # The simulation failed before the first control step ended.
-            commanded_violation, measured_violation = self._violations
-        self._violations = commanded_violation, measured_violation
-        forces = self._forces(peak_force, peak_contact_force)
-        cost = float(self.trace.unsafe(first_step).sum())
-        info = self._info(termination, commanded_violation, measured_violation, forces, cost, fallback, terms)
+        info = self._info(termination, first_step, terms)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -444,13 +420,10 @@ class DiagramEnv(DrakeGymEnv):
             displacement: Displacement of the pose, (O,).
 
         Raises:
-            InputError: If the task's robot cannot be pushed, or `displacement` is not O finite numbers.
+            InputError: If the task's robot cannot be pushed, or the displaced pose is not O finite numbers.
         """
         if self.diagram.push is None:
             raise InputError("this task has no robot that can be pushed")
-        displacement = as_numbers(displacement, "a push")
-        if displacement.shape != (self._pose_port.size(),) or not np.isfinite(displacement).all():
-            raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
         self.diagram.push(self.simulator.get_mutable_context(), displacement)
 
     def _check_action(self, action: Any) -> np.ndarray:
@@ -478,30 +451,25 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 
-    def _forces(self, force: float, contact_force: float) -> tuple[float, float]:
-        """Return the forces of the impedance, 0 if there is none, and of the contact [N]."""
-        return (force if self._has_impedance else 0.0), contact_force
+    def _info(self, termination: int, first: int, terms: Mapping[str, float]) -> dict[str, Any]:
+        """Return `info` of the control steps from number `first` on; a maximum of values that contain NaN is NaN.
 
-    def _info(
-        self,
-        termination: int,
-        commanded_violation: float,
-        measured_violation: float,
-        forces: tuple[float, float],
-        cost: float,
-        fallback: bool,
-        terms: Mapping[str, float],
-    ) -> dict[str, Any]:
+        Without such a control step, because the simulation failed in the first one, the violations are the last ones.
+        """
+        signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
+        if len(self.trace) > first:
+            commanded, measured = (float(signals[f"{name}_violation"].max()) for name in ("commanded", "measured"))
+            self._violations = commanded, measured
         failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
             "is_success": TERMINATIONS[termination] == Termination.SUCCESS,
             "termination": TERMINATIONS[termination].value,
-            "constraint_violation": commanded_violation,
-            "measured_violation": measured_violation,
-            "impedance_force": forces[0],
-            "contact_force": forces[1],
-            "cost": cost,
-            "fallback": fallback,
+            "constraint_violation": self._violations[0],
+            "measured_violation": self._violations[1],
+            "impedance_force": float(self.trace.force[first:].max(initial=0.0)) if self._has_impedance else 0.0,
+            "contact_force": float(signals["contact_force"].max(initial=0.0)),
+            "cost": float(self.trace.unsafe(first).sum()),
+            "fallback": bool(signals["fallback"].any()),
             "control_steps": self._control_steps,
             **terms,
             **failure,
@@ -518,11 +486,7 @@ def _plants(diagram: Diagram) -> Iterator[MultibodyPlant]:
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Check the render mode.
-
-    Raises:
-        InputError: If `render_mode` is not None, "human" or "rgb_array".
-    """
+    """Raise an InputError if `render_mode` is not None, "human" or "rgb_array"."""
     if render_mode not in (None, "human", "rgb_array"):
         raise InputError(f"there is no render mode {brief(render_mode)}: use None, 'human' or 'rgb_array'")
 

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.scene import Camera
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
@@ -113,8 +112,7 @@ class Observation(Diagram):
             waits: True if `CLOCKS` are computed from the input `motion_time` instead of the simulation time.
 
         Raises:
-            InputError: If there is no entry, an index is out of range, or a center or a scale has the wrong shape or
-                would not map finite signals to finite numbers.
+            InputError: If there is no entry, or a center or a scale would not map finite signals to finite numbers.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -179,35 +177,13 @@ def _add_clock(
 
 def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
-    try:
-        if term.entries is not None and not all(is_whole(entry, -size) for entry in term.entries):
-            raise ValueError
-        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
-    except (IndexError, TypeError, ValueError):
-        raise InputError(
-            f"the entries of the observed signal {term.signal!r}{of_task} are whole numbers from {-size} to "
-            f"{size - 1}, not {brief(term.entries)}"
-        ) from None
-    center, scale = (_numbers(term, name, len(selection), of_task) for name in ("center", "scale"))
+    selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
+    center, scale = (np.broadcast_to(values, len(selection)).astype(float) for values in (term.center, term.scale))
     with np.errstate(all="ignore"):
-        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(center / scale).all()
+        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite([center, scale, center / scale]).all()
     if not is_usable:
         raise InputError(
-            f"the observed signal {term.signal!r}{of_task} is divided by its scale, which cannot be {brief(term.scale)}"
+            f"the observed signal {term.signal!r}{of_task} has a center and a scale that are finite, and a scale that "
+            f"is not 0, unlike {brief(term.center)} and {brief(term.scale)}"
         )
     return selection, center, scale
-
-
-def _numbers(term: ObservationTerm, name: str, number: int, of_task: str) -> np.ndarray:
-    """Return a term's `center` or `scale`, selected by `name`, for each entry, (n,)."""
-    given = getattr(term, name)
-    try:
-        numbers = np.broadcast_to(given, number).astype(float)
-        if not np.isfinite(numbers).all():
-            raise ValueError
-    except (TypeError, ValueError):
-        raise InputError(
-            f"the {name} of the observed signal {term.signal!r}{of_task} is a finite number, or {number} of them, "
-            f"not {brief(given)}"
-        ) from None
-    return numbers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import fields
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
@@ -28,12 +28,6 @@ from guiderail.models.primitives.kernels import DEFAULT_KERNEL, DEFAULT_LENGTH_S
 
 STANDARD = "standard"
 """Default difficulty; every task has it."""
-
-
-def check_options_class(owner: str, attribute: str, given: object, kind: type[Options]) -> None:
-    """Raise an InputError unless an attribute of a task, a station or a guidance is a subclass of `kind`."""
-    if not (isinstance(given, type) and issubclass(given, kind)):
-        raise InputError(f"{attribute} of {owner} must be a subclass of {kind.__name__}, not {brief(given)}")
 
 
 class Options(BaseModel):
@@ -80,23 +74,19 @@ def option_fields(model: Any) -> dict[str, str]:
     return {entries.get(field, field): field for field in names}
 
 
-def flat_options(models: Iterable[Any], options: Mapping[str, Any]) -> dict[str, Any]:
+def flat_options(options: Mapping[str, Any], plain: Collection[str] = ()) -> dict[str, Any]:
     """Return options with the entries of every structured option as options of their own.
 
-    A mapping as the value of `history`, for example, becomes the options "history", "history.variance", ….
-
-    Args:
-        models: Models, or dataclasses, that declare the options.
-        options: Options by name. A name that no model declares remains as it is.
+    A mapping as the value of `history`, for example, becomes the options "history", "history.variance", …. Mappings of
+    entries, such as "kernel.parameters", and of the options `plain` remain values.
 
     Raises:
         InputError: If an option is given both in a mapping and by its own name, with different values.
     """
-    structured = {name.partition(".")[0] for model in models for name in option_fields(model) if "." in name}
     flat: dict[str, Any] = {}
     for name, value in options.items():
         entries = {name: value}
-        if name in structured and isinstance(value, Mapping):
+        if isinstance(value, Mapping) and "." not in str(name) and name not in plain:
             entries = {f"{name}.{entry}": content for entry, content in value.items()}
         for entry, content in entries.items():
             group, _, last = str(entry).partition(".")
@@ -235,12 +225,6 @@ class PrimitiveOptions(Options):
         le=1,
         description="smallest distance of an arm's commanded joint positions from their limits [rad]; default: no "
         "constraint",
-    )
-    min_singular_value: Number = Field(
-        0.0,
-        ge=0,
-        le=0.2,
-        description="smallest singular value of the arm's scaled Jacobian [m]; needs joint_margin",
     )
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: the motion waits for a robot that lags"

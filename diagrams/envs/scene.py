@@ -24,11 +24,10 @@ from pydrake.geometry import (
     RenderCameraCore,
     RenderEngineVtkParams,
     Role,
-    SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
-from pydrake.multibody.plant import ContactResults, MultibodyPlant
+from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
@@ -101,31 +100,25 @@ def front_camera(target: np.ndarray, distance: float, height: float) -> Camera:
 
 
 def add_camera(
-    builder: DiagramBuilder,
-    scene_graph: SceneGraph,
-    query: OutputPort,
-    name: str,
-    camera: Camera,
-    *,
-    plant: MultibodyPlant | None = None,
-    is_picture: bool = False,
+    builder: DiagramBuilder, station: Any, name: str, camera: Camera, *, is_picture: bool = False
 ) -> OutputPort:
-    """Add a camera and return the port of its color image, an `ImageRgba8U`.
+    """Add a camera in a station's scene and return the port of its color image, an `ImageRgba8U`.
 
-    `plant` is only needed for a camera that is fixed in a frame of the plant. With `is_picture`, the scene is lit for a
-    picture instead of an observation. An image is rendered only when the port is evaluated.
+    With `is_picture`, the scene is lit for a picture instead of an observation. An image is rendered only when the port
+    is evaluated.
 
     Raises:
-        InputError: If this machine lacks the library that renders without a display, or the station's plant lacks the
-            camera's frame.
+        InputError: If the station has no scene, this machine lacks the library that renders without a display, or the
+            station's plant lacks the camera's frame.
     """
+    query, scene_graph = scene_of(station), station.scene_graph
     check_rendering()
     parent, X_PC = scene_graph.world_frame_id(), camera.X_WC
     if camera.frame is not None:
-        if plant is None or not plant.HasFrameNamed(camera.frame):
+        if not station.plant.HasFrameNamed(camera.frame):
             raise InputError(f"this station has no frame {camera.frame!r} for a camera: choose another observation")
-        carrier = plant.GetFrameByName(camera.frame)
-        parent = plant.GetBodyFrameIdOrThrow(carrier.body().index())
+        carrier = station.plant.GetFrameByName(camera.frame)
+        parent = station.plant.GetBodyFrameIdOrThrow(carrier.body().index())
         X_PC = carrier.GetFixedPoseInBodyFrame() @ camera.X_WC
     # Mesa and Triton, a dependency of PyTorch with CUDA, load different versions of LLVM. If Triton's is loaded second,
     # the process ends with a segmentation fault. PyTorch imports Triton late, with its compiler.
@@ -146,18 +139,6 @@ def add_camera(
     return add_system(builder, name, sensor, query).color_image_output_port()
 
 
-def add_observation_camera(builder: DiagramBuilder, station: Any, camera: Camera) -> OutputPort:
-    """Add the camera of an observation in a station's scene; return the port of its image.
-
-    Raises:
-        InputError: If the station renders no images, or as `add_camera`.
-    """
-    if not station.HasOutputPort("query"):
-        raise InputError("this station renders no images: choose another observation")
-    query, plant = station.GetOutputPort("query"), getattr(station, "plant", None)
-    return add_camera(builder, station.scene_graph, query, "observation_camera", camera, plant=plant)
-
-
 def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, task: str) -> None:
     """Add the camera for pictures of a task and export its image; `task` is the name of the task.
 
@@ -168,9 +149,7 @@ def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, ta
         raise InputError(
             f"{task} has no camera: leave out render_mode='rgb_array' or --image, or give its scene() a camera"
         )
-    query = scene_of(station)
-    picture = add_camera(builder, station.scene_graph, query, "picture", camera, is_picture=True)
-    builder.ExportOutput(picture, "rgb_image")
+    builder.ExportOutput(add_camera(builder, station, "picture", camera, is_picture=True), "rgb_image")
 
 
 def scene_of(station: Any) -> OutputPort:
@@ -180,7 +159,9 @@ def scene_of(station: Any) -> OutputPort:
         InputError: If the station has no scene, because it is a real robot.
     """
     if not station.HasOutputPort("query"):
-        raise InputError("this station has no scene to draw: choose a simulated one, or leave render_mode out")
+        raise InputError(
+            "this station has no scene to render: choose a simulated one, or another observation and no render_mode"
+        )
     return station.GetOutputPort("query")
 
 

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
+from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from guiderail.diagrams.envs.scene import View
-from guiderail.models.common.arrays import as_number, is_whole
 from guiderail.models.common.errors import InputError
 
 PORTS = (
@@ -143,9 +142,7 @@ class TaskDiagram:
         config: Configuration of the environment, if there is one.
 
     Raises:
-        InputError: If the diagram lacks a port, the size of the observation does not match its space,
-            `control_period` is not positive or no multiple of a discrete plant's time step, `num_steps` is not a
-            positive whole number, or the size of a symmetry does not match the observation and the action.
+        InputError: If the diagram lacks a port, or `control_period` is no multiple of a discrete plant's time step.
     """
 
     diagram: Diagram
@@ -170,15 +167,8 @@ class TaskDiagram:
 
     def __post_init__(self) -> None:
         missing = [name for name in (*PORTS, *self.reward_terms) if not self.diagram.HasOutputPort(name)]
-        if not self.diagram.HasInputPort("action"):
-            missing.append("action")
         if missing:
             raise InputError(f"the task's diagram {self.diagram.get_name()!r} exports no port {', '.join(missing)}")
-        port, shape = self.diagram.GetOutputPort("observation"), self.observation_space.shape
-        if port.get_data_type() == PortDataType.kVectorValued and shape != (port.size(),):
-            raise InputError(f"the observation has {port.size()} entries, but observation_space has the shape {shape}")
-        if not is_whole(self.num_steps, 1) or not as_number(self.control_period, "control_period") > 0:
-            raise InputError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
         for step in plant_steps(self.diagram):
             number = round(self.control_period / step)
             if number < 1 or abs(number * step - self.control_period) > 1e-6:
@@ -186,9 +176,3 @@ class TaskDiagram:
                     f"the control period of {self.control_period:g} s is no whole multiple of a plant's time step of "
                     f"{step:g} s: choose another time step"
                 )
-        for symmetry in (self.symmetry, self.near_symmetry):
-            if symmetry is not None and (
-                symmetry.observations.shape[1:] != 2 * self.observation_space.shape
-                or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
-            ):
-                raise InputError("the matrices of a symmetry must have the sizes of the observation and the action")

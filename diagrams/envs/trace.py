@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
-
 TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 QUASI_STATIC_TIME = 0.5  # contact that lasts longer is quasi-static, not transient (ISO/TS 15066) [s]
 
@@ -96,23 +94,14 @@ class EpisodeTrace:
         reward: float,
         signals: Mapping[str, np.ndarray],
     ) -> None:
-        """Record one control step: poses (O,), force [N] as in `force`, reward and signals.
-
-        Raises:
-            InputError: If a signal of the trace is missing.
-        """
+        """Record one control step: poses (O,), force [N] as in `force`, reward and signals."""
         n = self._length
         self._commanded[n] = commanded
         self._measured[n] = measured
         self._force[n] = force
         self._reward[n] = reward
-        try:
-            for name, values in self._signals.items():
-                values[n] = signals[name]
-        except KeyError as error:
-            raise InputError(
-                f"a control step lacks the signal {error} of the trace: its signals are {sorted(signals)}"
-            ) from None
+        for name, values in self._signals.items():
+            values[n] = signals[name]
         self._length = n + 1
 
     def statistics(self) -> dict[str, float]:

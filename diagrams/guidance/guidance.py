@@ -33,7 +33,7 @@ from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws.law import Law
-from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.command_checks import ConstraintViolation
 from guiderail.systems.law_system import LawSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
 

@@ -15,16 +15,23 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.command_filters import BarrierFilter, CommandLaw, KeepOutFilter, TangentSpaceFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import (
+    BarrierFilter,
+    CommandLaw,
+    KeepOut,
+    KeepOutFilter,
+    TangentSpaceFilter,
+)
 from guiderail.models.control.motion_constraints import MotionConstraintFilter
 from guiderail.models.laws.primitive import PrimitiveLaw
-from guiderail.systems.command_filter import CommandFilter
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.history import HistoryBuffer, HistoryLengthSchedule
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
-from guiderail.systems.progress_clock import ProgressClock
-from guiderail.systems.residual import Residual
+from guiderail.systems.command_checks import CommandFilter, ConstraintViolation
+from guiderail.systems.movement_primitive import (
+    HistoryBuffer,
+    HistoryLengthSchedule,
+    LcNsKmpSystem,
+    ProgressClock,
+    Residual,
+)
 
 MakeFilter = Callable[[PrimitiveConfig, KeepOut], CommandLaw]
 """Function of the primitive's configuration and the keep-out walls that returns the filter of a residual's commands."""

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON, get_shared_primitive
 
 if TYPE_CHECKING:
-    from guiderail.models.control.keep_out import KeepOut
+    from guiderail.models.control.command_filters import KeepOut
     from guiderail.models.control.motion_constraints import MotionConstraints
     from guiderail.models.laws import StateProgress
     from guiderail.models.templates import SharedControlTemplate
@@ -63,7 +63,6 @@ class PrimitiveConfig:
         gains: Null-space action per unit of the policy's action, (O,); default: computed from κ.
         isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
             outputs of a group. Default: one group.
-        solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
         keep_out: Walls at which safe residual RL stops the robot, if the task provides any.
         progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
         wrench_size: W, size of a measured wrench.
@@ -88,7 +87,6 @@ class PrimitiveConfig:
     action_dims: tuple[int, ...] | None = None
     gains: tuple[float, ...] | None = None
     isotropic_groups: tuple[tuple[int, ...], ...] | None = None
-    solver: str = "daqp"
     keep_out: KeepOut | None = None
     motion: MotionConstraints | None = None
     progress: StateProgress | None = None
@@ -153,7 +151,6 @@ class PrimitiveConfig:
             horizon=self.horizon,
             history=self.history if history else 0,
             history_variance=self.history_variance,
-            solver=self.solver,
         )
 
     def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:
@@ -273,9 +270,6 @@ class PriorKnowledge:
         options: Options of the guidance by name; empty if it declares none.
         pose_size: Size O of the station's pose.
         wrench_size: Size W of the station's wrench.
-
-    Raises:
-        InputError: If the template is not a `PlacedTemplate`.
     """
 
     period: float
@@ -285,10 +279,6 @@ class PriorKnowledge:
     options: Mapping[str, Any] = field(default_factory=dict)
     pose_size: int = POSE_SIZE
     wrench_size: int = WRENCH_SIZE
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.template, PlacedTemplate | None):
-            raise InputError(f"a task's template is a PlacedTemplate with its frames, not {brief(self.template)}")
 
     @property
     def constraints(self) -> LinearConstraints:

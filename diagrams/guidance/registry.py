@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry, check_callable
+from guiderail.models.common.registry import Registry, check_kind, did_you_mean
 from guiderail.models.laws.law import Law
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class GuidanceKind:
         build: Function from prior knowledge to a diagram with the ports of `Guidance`, or to a `Law`; or a subclass of
             `Law`, which is called with the size of the pose and `known`.
         needs: Alternative tuples of names in `REQUIREMENTS`; the task must provide all names of one alternative.
-        label: Label in figures.
+        label: Label in figures; default: `name`.
         color: Color in figures, "#rrggbb".
         demonstrates: True if an action of zero reproduces the demonstrations or the scripted approach, so that the
             success before learning can be evaluated.
@@ -49,13 +50,16 @@ class GuidanceKind:
 
     name: str
     build: Callable[[PriorKnowledge], Diagram | Law] | type[Law]
-    needs: tuple[tuple[str, ...], ...]
-    label: str
-    color: str
+    needs: tuple[tuple[str, ...], ...] = ()
+    label: str = ""
+    color: str = "#17becf"
     demonstrates: bool = False
     displaces: bool = False
     options: type[Options] | None = None
     ignores_actions: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.name)
 
 
 def missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collection[str]) -> tuple[str, ...]:
@@ -64,64 +68,27 @@ def missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collectio
     return min(missing, key=len, default=())
 
 
-def _check(name: str, kind: object) -> None:
-    """Raise an `InputError` unless `kind` is a `GuidanceKind` whose builder and options have the right types."""
-    if not isinstance(kind, GuidanceKind):
-        raise InputError(f"the guidance {name!r} is registered by @register_guidance, not as {brief(kind)}")
-    check_callable(name, kind.build)
-    if kind.options is not None:
-        from guiderail.diagrams.envs.options import Options, check_options_class
-
-        check_options_class(name, "options", kind.options, Options)
+GUIDANCE: Registry[GuidanceKind] = Registry("guidance", plugin="guidance", check=check_kind(GuidanceKind))
 
 
-GUIDANCE: Registry[GuidanceKind] = Registry(
-    "guidance",
-    plugin="guidance",
-    check=_check,
-)
-
-
-def register_guidance(
-    name: str,
-    *,
-    needs: tuple[tuple[str, ...], ...] = (),
-    label: str | None = None,
-    color: str = "#17becf",
-    demonstrates: bool = False,
-    displaces: bool = False,
-    options: type[Options] | None = None,
-    ignores_actions: bool = False,
-) -> Callable[[Builder], Builder]:
+def register_guidance(name: str, **declared: Any) -> Callable[[Builder], Builder]:
     """Return a decorator that registers a subclass of `Law`, or a function of a `PriorKnowledge`.
-
-    The decorator raises an `InputError` if another kind of guidance has this name, or an argument or the decorated
-    object has the wrong type.
 
     Args:
         name: Value of the option `guidance`.
-        needs: See `GuidanceKind`.
-        label: Label in figures; default: `name`.
-        color: Color in figures, "#rrggbb".
-        demonstrates: See `GuidanceKind`.
-        displaces: See `GuidanceKind`.
-        options: Model of further options of the environment.
-        ignores_actions: See `GuidanceKind`.
+        **declared: Attributes of the `GuidanceKind`, such as `needs`, `label`, `color`, `demonstrates` and `options`.
 
     Raises:
-        InputError: If the name is not a word, or `needs` are not tuples of names in `REQUIREMENTS`.
+        InputError: If the name is not a word, or `needs` has a name that is not in `REQUIREMENTS`. The decorator raises
+            it if another kind of guidance has this name.
     """
     GUIDANCE.check_name(name)
-    are_tuples = isinstance(needs, list | tuple) and all(isinstance(names, list | tuple) for names in needs)
-    if not are_tuples or not all(each in REQUIREMENTS for names in needs for each in names):
-        raise InputError(
-            f"needs of guidance {name!r} must be tuples of the names {', '.join(REQUIREMENTS)}, such as "
-            f"(('template',),), not {brief(needs)}"
-        )
+    for requirement in chain(*declared.get("needs", ())):
+        if requirement not in REQUIREMENTS:
+            raise InputError(f"guidance {name!r} needs {brief(requirement)}: {did_you_mean(requirement, REQUIREMENTS)}")
 
     def add(build: Builder) -> Builder:
-        kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options, ignores_actions)
-        GUIDANCE.register(name, kind)
+        GUIDANCE.register(name, GuidanceKind(name, build, **declared))
         return build
 
     return add
@@ -170,11 +137,8 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
         task: Name of the task, for the error message.
 
     Raises:
-        InputError: If there is no such kind, a requirement is missing, or its builder returns neither a diagram nor a
-            law.
+        InputError: If there is no such kind, or a requirement is missing.
     """
-    from pydrake.systems.framework import System
-
     kind = check_guidance(name, [requirement for requirement in REQUIREMENTS if prior.has(requirement)], task)
     if kind.options is not None:
         fields = kind.options.model_fields.items()
@@ -187,7 +151,5 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
         from guiderail.diagrams.guidance.guidance import LawGuidance
 
         guidance = LawGuidance(prior, guidance)
-    if not isinstance(guidance, System):
-        raise InputError(f"the builder of guidance '{name}' must return a diagram or a Law, not {brief(guidance)}")
     guidance.set_name("guidance")
     return guidance

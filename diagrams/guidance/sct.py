@@ -16,10 +16,8 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
-from guiderail.systems.residual import Residual
-from guiderail.systems.sct_input_mapping import SctInputMapping
-from guiderail.systems.sct_state_machine import SctStateMachine
+from guiderail.systems.movement_primitive import Residual
+from guiderail.systems.shared_control_template import ActiveConstraintProjector, SctInputMapping, SctStateMachine
 
 
 class ActiveConstraintFilter(Diagram):

@@ -33,11 +33,9 @@ from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
 from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import EndEffector, Robot, find_end_effector, find_robot
-from guiderail.systems.external_torque_sensor import ExternalTorqueSensor, JointTorqueErrors
 from guiderail.systems.gripper_command import GripperCommand
-from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import ExternalTorqueSensor, JointTorqueErrors, JointTorqueWrench, WrenchSensor
 
 WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # filter time constant of a wrench estimated from joint torques [s]
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
@@ -253,10 +251,10 @@ class ArmStation(Station):
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
-    def joint_range(self, margin: float, min_singular_value: float) -> JointRange:
+    def joint_range(self, margin: float) -> JointRange:
         """Return constraints on the joint positions at a commanded pose; see `JointRange`."""
         model = self._controller_plant
-        return JointRange(model.plant, model.target, model.tool_center, model.posture, margin, min_singular_value)
+        return JointRange(model.plant, model.target, model.tool_center, model.posture, margin)
 
     def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
         """Add joint torque sensors and the estimate of the wrench; return its port."""

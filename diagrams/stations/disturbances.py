@@ -20,10 +20,10 @@ from guiderail.diagrams.stations.station import (
     tare_steps,
     whole_multiple,
 )
+from guiderail.diagrams.stations.wrapped_stations import WrappedStation
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
-from guiderail.models.control.motion_constraints import StateConstraints
 from guiderail.systems.disturbances import CommandDisturbance, SensorDisturbance
 from guiderail.systems.wrench_signals import WrenchTare
 
@@ -32,7 +32,7 @@ EXACT_WRENCH = "exact_wrench"
 """Port of the wrench without sensor errors, (6,)."""
 
 
-class DisturbedStation(Station):
+class DisturbedStation(WrappedStation):
     """A station with disturbances between its ports and the ports of an inner station.
 
     Measured pose and wrench are disturbed; success and the contact force, by which collisions are detected, are not.
@@ -45,15 +45,14 @@ class DisturbedStation(Station):
         Raises:
             InputError: If the station does not support one of the disturbances.
         """
-        super().__init__()
+        super().__init__(station)
         d = self._disturbances = disturbances
         if d.payload and not hasattr(station, "set_payload"):
             raise InputError("a payload hangs from an arm's tool: choose station=arm, or leave payload out")
-        self.plant, self.scene_graph = station.plant, station.scene_graph
         self.control_period, self.wraps_angles = _disturbed_period(d, station), station.wraps_angles
         period = self.control_period
         builder = DiagramBuilder()
-        self._inner = builder.AddNamedSystem("station", station)
+        builder.AddNamedSystem("station", station)
         self._commands = commands = CommandDisturbance(POSE_SIZE, period, d.lost_commands, d.late_commands)
         builder.AddNamedSystem("commands", commands)
         e = self._errors = _without_replaced_errors(d, station)
@@ -119,19 +118,6 @@ class DisturbedStation(Station):
                 add_system(builder, "wrench_delay", self._delay, measurement=measured)
                 measured = self._delay.get_disturbed_measurement_output_port()
         return measured
-
-    @property
-    def nominal_period(self) -> float:
-        """Time between commands of the inner station [s]."""
-        return self._inner.nominal_period
-
-    def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the robot at rest with its true tool center at `pose`, (6,); `context` is the root context."""
-        self._inner.set_pose(context, pose)
-
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
-        """Return the constraints of the inner station's joints."""
-        return self._inner.joint_range(margin, min_singular_value)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the disturbances of an episode; return them by name."""

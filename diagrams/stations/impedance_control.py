@@ -17,10 +17,8 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.energy_tank import EnergyTank
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
-from guiderail.systems.reference_governor import ReferenceGovernor
+from guiderail.systems.command_checks import CommandWatchdog
+from guiderail.systems.wrench_limits import EnergyTank, PhaseWrenchLimit, ReferenceGovernor
 from guiderail.systems.wrench_signals import ForceMonitor
 
 if TYPE_CHECKING:

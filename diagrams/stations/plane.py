@@ -24,8 +24,8 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
-from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.models.objects.narrow_passage import PassageGeometry
+from guiderail.systems.command_checks import CommandWatchdog
 from guiderail.systems.wrench_signals import MeanForce
 
 OBSTACLE_Z = -0.035  # height of the visual obstacles [m]; the robot passes above them

@@ -22,14 +22,14 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.objects.pouring import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot
-from guiderail.systems.body_poses import MeasuredPose, RelativePoses
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_detector import ContactDetector
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.poses import MeasuredPose, RelativePoses
+from guiderail.systems.wrench_sensors import WrenchSensor
 
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
@@ -172,7 +172,7 @@ class PouringStation(Station):
         self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(config.num_balls)]
         x, y, z = config.p_WStand
         X_WTable = RigidTransform([x + 0.1, y - 0.1, z - 0.05])  # the table begins next to the arm's base
-        add_shape(plant, plant.world_body(), "table", X_WTable, Box(1.0, 1.6, 0.1), WOOD)
+        add_shape(plant.world_body(), "table", X_WTable, Box(1.0, 1.6, 0.1), WOOD)
         plant.Finalize()
         thermos = plant.GetBodyByName("thermos")
 
@@ -255,7 +255,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     # The hand is a cylinder from the flange to the thermos's wall; it is part of the thermos's body.
     length = config.grip - config.thermos.outer_radius
     X_PHand = config.X_FlangeP.inverse() @ RigidTransform([0.0, 0.0, length / 2])
-    add_shape(plant, thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
+    add_shape(thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
     for model in (arm.model, thermos.model_instance()):
         # Without gravity, as on a real arm under position control, where integral action compensates gravity.
         plant.set_gravity_enabled(model, False)
@@ -268,7 +268,7 @@ def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> 
     """Add the stand under the mug; it is part of the mug's body and moves with it."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
-        add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
+        add_shape(mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
 
 
 def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:

@@ -26,7 +26,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.parsing import follow_directives
 from guiderail.models.common.yaml import MAX_SIZE, check_yaml
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import WrenchSensor
 
 _TAGS = ("!Rpy",)  # accepted tags of directives
 

@@ -39,7 +39,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -252,12 +252,8 @@ class Station(Diagram):
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(plant_context, np.r_[positions, 0.0 * positions])
 
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
-        """Return constraints that keep the robot's joints within their limits and away from singular postures.
-
-        Args:
-            margin: Distance from the limits [rad].
-            min_singular_value: Smallest singular value of the scaled Jacobian [m]; 0 for no constraint.
+    def joint_range(self, margin: float) -> StateConstraints:
+        """Return constraints that keep the robot's joints within their limits and a margin [rad].
 
         Raises:
             InputError: If the station has no arm.
@@ -341,16 +337,37 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared | config), builder)
 
 
-def add_position_ports(
-    builder: DiagramBuilder, plant: MultibodyPlant, model: ModelInstanceIndex
-) -> tuple[InputPort, OutputPort]:
-    """Return ports of the desired positions (n,), at rest, and of the positions (n,) of joints with PD gains."""
-    n = plant.num_positions(model)
-    desired = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * n, n)))
-    builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(model))
-    positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
-    builder.Connect(plant.get_state_output_port(model), positions.get_input_port())
-    return desired.get_input_port(), positions.get_output_port()
+class JointStation(Station):
+    """Station of a robot whose pose is the positions of its joints, which follow a command by their own PD gains.
+
+    A subclass adds the robot.
+
+    Args:
+        workcell: Workcell of the task, which `add_robot` gets.
+
+    Attributes:
+        plant_step: Time step of the plant [s]; the control period is a multiple of it.
+    """
+
+    plant_step: ClassVar[float] = PLANT_PERIOD
+
+    def __init__(self, workcell: Any):
+        """Construct the station."""
+        super().__init__()
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = plant, _ = add_plant(builder, self.plant_step)
+        robot = self.add_robot(plant, workcell)
+        plant.Finalize()
+        n = plant.num_positions(robot)
+        desired = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * n, n)))  # at rest
+        builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(robot))
+        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
+        builder.Connect(plant.get_state_output_port(robot), positions.get_input_port())
+        self.finish(builder, desired.get_input_port(), pose=positions.get_output_port())
+
+    def add_robot(self, plant: MultibodyPlant, workcell: Any) -> ModelInstanceIndex:
+        """Add joints with PD gains, and what surrounds them, to the plant; return the model of the joints."""
+        raise NotImplementedError
 
 
 def plant_period(workcell: Workcell, longest: float = PLANT_PERIOD) -> float:

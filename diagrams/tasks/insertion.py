@@ -28,6 +28,7 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
+    CONTACT_MEMORY,
     MIN_CONTACT_FORCE,
     ForceOptions,
     HiddenOffsets,
@@ -37,10 +38,10 @@ from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, 
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import MM, POSE_SIZE
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.body_poses import RelativePoses
-from guiderail.systems.wrench_signals import CenterOfPressure
+from guiderail.systems.poses import RelativePoses
+from guiderail.systems.wrench_signals import CenterOfPressure, MeanContactPoint
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 
@@ -294,7 +295,8 @@ def sides_of_the_rim(
         # In a pose, Ry comes before Rx.
         pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
-        contact_terms = () if observation == "state" else (across, across)  # center of pressure, and commanded x and y
+        # center of pressure, commanded x and y, and mean contact point
+        contact_terms = (across,) * {"state": 0, "mean_contact_point": 3}.get(observation, 2)
         observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms, *more(across)))
         poses.append(pose)
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
@@ -308,7 +310,8 @@ class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
-    and y. "image" is the wrist camera's image alone; "image_and_state" adds it to the state.
+    and y, and "mean_contact_point" also the mean of the points of contact in the last second. "image" is the wrist
+    camera's image alone; "image_and_state" adds it to the state.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28): costs of actions and forces, and a terminal reward.
     "shaped" adds the depth gained. "aligned" adds the depth gained and the distance gained towards the fixture's axis.
@@ -354,7 +357,14 @@ class DemonstratedInsertion(InsertionTask):
         """Return the workpiece's pose in the fixture and the center of pressure."""
         system = CenterOfPressure(MIN_CONTACT_FORCE)
         add_system(builder, "center_of_pressure", system, wrench=station.get_wrench_output_port())
-        return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
+        mean = MeanContactPoint(MIN_CONTACT_FORCE, period=station.control_period, time_constant=CONTACT_MEMORY)
+        pose, wrench = station.get_pose_output_port(), station.get_wrench_output_port()
+        add_system(builder, "mean_contact_point", mean, pose=pose, wrench=wrench)
+        return {
+            **super().signals(builder, station),
+            "center_of_pressure": system.get_center_of_pressure_output_port(),
+            "mean_contact_point": mean.get_mean_contact_point_output_port(),
+        }
 
     def observed(self, center: np.ndarray, scale: np.ndarray, wrench_scale: np.ndarray) -> Observed:
         """Return the observation, for center and scale of the pose (6,) and scale of the wrench (6,)."""
@@ -367,9 +377,11 @@ class DemonstratedInsertion(InsertionTask):
             ObservationTerm("pose", center, scale),
             ObservationTerm("wrench", 0.0, wrench_scale),
         ]
-        if self.observation == "center_of_pressure":
+        if self.observation in ("center_of_pressure", "mean_contact_point"):
             terms.append(ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE))
             terms.append(ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+        if self.observation == "mean_contact_point":
+            terms.append(ObservationTerm("mean_contact_point", 0.0, CENTER_OF_PRESSURE_SCALE))
         return Observed((*terms, *self.force_limit_terms()), camera, PRIVILEGED)
 
     def rewards(self) -> dict[str, Callable[..., float]]:

@@ -19,6 +19,7 @@ from guiderail.models.primitives.reference import interpolate_prior
 
 COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
 MIN_CONTACT_FORCE = 0.5  # smallest force along z at which a center of pressure is computed [N]
+CONTACT_MEMORY = 1.0  # time over which points of contact are averaged [s]
 
 # Scales of the observed center of pressure and of the observed command. The center of pressure, unlike the torque, does
 # not increase with the contact force. The command is observed because the measured pose of a plug on a rim does not
@@ -154,7 +155,7 @@ def reference_of_file(
         )
     num_steps = control_steps(demonstrations)
     fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), prior_std=prior_std
+        demonstrations.resampled(num_steps), components=components, floor=np.array(floor), prior_std=prior_std
     )
     times = CONTROL_PERIOD * np.arange(num_steps)
     _REFERENCES[key] = ReferenceTrajectory(times, fitted.means, fitted.covariances)

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import gymnasium
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import load_plugin
-from guiderail.models.common.registry import Registry, did_you_mean
+from guiderail.models.common.registry import Registry, check_class, did_you_mean, load_plugin
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
@@ -22,11 +21,7 @@ if TYPE_CHECKING:
     TaskClass = TypeVar("TaskClass", bound=type[Task])
 
 IMPORT_HINT = ", or --import the file that registers it"
-TASKS: Registry[type[Task]] = Registry(
-    "task",
-    plugin="task",
-    check=lambda name, task: _check(name, task),
-)
+TASKS: Registry[type[Task]] = Registry("task", plugin="task", check=lambda name, task: _check(name, task))
 
 
 def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
@@ -36,8 +31,8 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
         name: Name of the task; it may have a namespace, as in "lab/Peg".
 
     Raises:
-        InputError: If the name is not a word. The decorator raises it if another task has this name, a required method
-            is missing, or a declaration has the wrong type.
+        InputError: If the name is not a word. The decorator raises it if another task has this name, or a required
+            method is missing.
     """
     TASKS.check_name(name)
 
@@ -69,20 +64,10 @@ def check_task_name(name: object) -> None:
 
 
 def _check(name: str, task: type[Task]) -> None:
-    """Raise an `InputError` if a task class lacks a method, or an attribute has the wrong type."""
-    from guiderail.diagrams.envs.options import ResetOptions, check_options_class
-    from guiderail.diagrams.stations.registry import kind_of
+    """Raise an `InputError` if an object is no task class, or the class lacks a method."""
     from guiderail.diagrams.tasks.task import Task
 
-    if not (isinstance(task, type) and issubclass(task, Task)):
-        raise InputError(f"the task {name!r} is registered with a class derived from Task, not with {brief(task)}")
-    if inspect.isabstract(task):
-        missing = ", ".join(f"{method}()" for method in sorted(task.__abstractmethods__))
-        raise InputError(f"{name} lacks {missing}: every task must define these methods")
-    kind_of(getattr(task, "station", None), name)
-    check_options_class(name, "Reset", task.Reset, ResetOptions)
-    if not isinstance(task.clip, int | float) or not task.clip > 0:
-        raise InputError(f"clip of {name} must be a positive number, not {brief(task.clip)}")
+    check_class(name, task, Task)
     if not isinstance(inspect.getattr_static(task, "scripted_policies"), classmethod | staticmethod):
         raise InputError(
             f"scripted_policies of {name} is called without an instance: make it a @classmethod with the arguments "

@@ -22,7 +22,6 @@ from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import Prior
-from guiderail.diagrams.stations.registry import StationKind, kind_of
 from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import TERMINATIONS
@@ -140,7 +139,7 @@ class Task(option_models.TaskOptions):
     of `signals`, or `action`, `termination` or `action_repeat`, the number of control steps per action. A name with the
     prefix "last_" is the signal's value one control step earlier. An option is a field with a type, a range and a
     description; `reward` and `observation` are options of every task, and a task with several declares their names as
-    `Literal`.
+    `Literal`. A validator of pydantic refuses options that are incompatible.
 
     Attributes:
         name: Name, set by `register_task`.
@@ -170,9 +169,6 @@ class Task(option_models.TaskOptions):
     clip: ClassVar[float] = 3.0
     statistics: ClassVar[tuple[Metric, ...]] = ()
     has_held_out_distribution: ClassVar[bool] = False
-
-    def check(self) -> None:
-        """Raise an `InputError` if options are incompatible."""
 
     @property
     def duration(self) -> float | None:
@@ -264,11 +260,6 @@ class Task(option_models.TaskOptions):
     def folder_digest(cls) -> str:
         """Return a digest of the files of `folder`; "" if the task has no folder."""
         return ""
-
-    @classmethod
-    def station_kind(cls) -> StationKind:
-        """Return the registered kind of the default station."""
-        return kind_of(cls.station, cls.name)
 
     @classmethod
     def supports(cls, station: str) -> bool:

@@ -73,8 +73,6 @@ _SOFTWARE: dict[str, dict[str, str]] = {
         "matplotlib": "matplotlib",
     },
     "learn": {"torch": "PyTorch", "stable_baselines3": "Stable-Baselines3", "sb3_contrib": "sb3-contrib"},
-    "osqp": {"osqp": "OSQP"},
-    "piqp": {"piqp": "PIQP"},
     "mujoco": {"mujoco": "MuJoCo"},
     "parts": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
     "repair": {"pytetwild": "pytetwild", "pyvista": "PyVista"},

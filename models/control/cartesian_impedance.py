@@ -25,10 +25,9 @@ _SCALE = np.repeat([1.0, LEVER], 3)
 class ArmImpedance(NamedTuple):
     """Arm and impedance at an instant, the arguments of the law: floats or, for derivatives, `AutoDiffXd`."""
 
-    K: np.ndarray  # stiffness (6, 6) [N/m, Nm/rad] in the axes of the stiffness frame
+    K: np.ndarray  # stiffness (6, 6) [N/m, Nm/rad]
     damping_ratio: Any  # damping ratio ζ of every mode
-    wrench_limits: np.ndarray  # limits (6,) along the axes of the stiffness frame [N, Nm]
-    R_axes: np.ndarray | None  # rotation (3, 3) from the stiffness frame to the frame of all other quantities, or None
+    wrench_limits: np.ndarray  # limits (6,) along the axes [N, Nm]
     p_error: np.ndarray  # position error (3,) [m], as in `spring_wrench`
     eta: Any  # scalar part of the orientation error, as in `spring_wrench`
     epsilon: np.ndarray  # vector part (3,) of the orientation error, as in `spring_wrench`
@@ -120,19 +119,13 @@ def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> Jo
     """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
     Without a bound, the sum of spring and damper is clipped per axis. The tool never pushes beyond the limits, but can
-    follow a fast command, for which spring and damper cancel. With a bound along the axes of the stiffness frame,
-    `bounded_wrench` limits the sum. N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the
-    tool.
+    follow a fast command, for which spring and damper cancel. With a bound, `bounded_wrench` limits the sum.
+    N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the tool.
 
     Raises:
         LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.
     """
-    K, J, R_axes = law.K, law.J, law.R_axes
-    if R_axes is not None:
-        R = np.zeros((6, 6))
-        R[:3, :3] = R[3:, 3:] = R_axes
-        K = R @ law.K @ R.T
-
+    K, J = law.K, law.J
     _, M_inverse_JT, failed = lapack.dposv(law.M, J.T, lower=1)
     if failed:
         raise np.linalg.LinAlgError("the arm's mass matrix is not positive definite")
@@ -143,18 +136,13 @@ def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> Jo
     damping = L_modes @ (_dampings(eigenvalues, law.damping_ratio) * (L_modes.T @ velocity))
     spring = spring_wrench(K, law.p_error, law.eta, law.epsilon)
     unlimited_wrench = spring - damping
-    along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
     if bound is None:
-        wrench = _clipped(along_axes, law.wrench_limits)
-        is_limited = bool((np.abs(along_axes) >= law.wrench_limits).any())
+        wrench = _clipped(unlimited_wrench, law.wrench_limits)
+        is_limited = bool((np.abs(unlimited_wrench) >= law.wrench_limits).any())
     else:
         mass = _mass_along(velocity[:3], Lambda_inverse)
-        if R_axes is not None:
-            spring, damping, velocity = R.T @ spring, R.T @ damping, R.T @ velocity
         wrench = bounded_wrench(spring, damping, velocity[:3], mass, bound)
-        is_limited = bool(np.abs(wrench - along_axes).max() > _ROUNDING)
-    if R_axes is not None:
-        wrench = R @ wrench
+        is_limited = bool(np.abs(wrench - unlimited_wrench).max() > _ROUNDING)
     tool_acceleration = M_inverse_JT.T @ law.posture_torque
     if _is_regular(R_inverse):
         leak = R_inverse.T @ (R_inverse @ tool_acceleration)  # tool wrench of the posture's torque

@@ -25,7 +25,6 @@ _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
 # clipped, because the command is the desired one plus a move, and the sum of two large numbers is inexact.
 _REACH = 1e4
 _ROUNDING = 5e-7  # share of the width of the speed and acceleration box by which a solution may exceed the box
-_CUTS = 4  # number of linearizations of the `inside` shapes
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
 
 
@@ -45,7 +44,7 @@ class Violations(NamedTuple):
     """Largest violation of each kind of constraint, negative inside and −inf without constraints of the kind."""
 
     linear: float  # max(c − G y) with rows of unit norm [unit of the output]
-    shapes: float  # largest depth inside an `outside` shape, or distance outside an `inside` shape [m]
+    shapes: float  # largest depth inside a shape [m]
     state: float  # largest violation of state constraints, such as joint limits [rad]
 
 
@@ -59,7 +58,6 @@ class MotionConstraints:
 
     linear: LinearConstraints  # G y ≥ c on every command (O,), the same at every step
     outside: Sequence[ConvexShape] = ()  # shapes that the commanded positions (the first D outputs) must not enter
-    inside: Sequence[ConvexShape] = ()  # shapes that the commanded positions must not leave
     max_speed: ArrayLike | None = None  # largest speed of each output, (O,) [unit/s]; infinite by default
     max_acceleration: ArrayLike | None = None  # largest acceleration, (O,) [unit/s²]; infinite by default
     state: Sequence[StateConstraints] = ()  # further constraints, such as joint limits
@@ -67,7 +65,7 @@ class MotionConstraints:
     def __post_init__(self) -> None:
         if self.linear.num_steps is not None:
             raise InputError("shapes, speed and acceleration need linear constraints that do not change between steps")
-        if any(shape.num_dims > self.num_outputs for shape in (*self.outside, *self.inside)):
+        if any(shape.num_dims > self.num_outputs for shape in self.outside):
             raise InputError(f"a shape has more dimensions than a command has outputs, {self.num_outputs}")
         for name in ("max_speed", "max_acceleration"):
             value = getattr(self, name)
@@ -92,7 +90,6 @@ class MotionConstraints:
         A violation is NaN if that of one constraint is NaN, as for a command with NaN.
         """
         shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
-        shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
         state = [constraint.violation(output) for constraint in self.state]
         return Violations(self.linear.violation(output), _largest(shapes), _largest(state))
 
@@ -123,7 +120,7 @@ def _largest(violations: list[float]) -> float:
 class MotionConstraintFilter:
     """Filter that computes the nearest command within `MotionConstraints` from which the motion can still stop.
 
-    In each step all constraints are replaced by linear constraints. The `outside` shapes become half-spaces, linearized
+    In each step all constraints are replaced by linear constraints. The shapes become half-spaces, linearized
     at the last command, so that the true constraint also holds between two commands. Speed and acceleration become
     boxes
 
@@ -190,7 +187,7 @@ class MotionConstraintFilter:
         desired = np.minimum(np.maximum(desired, last - _REACH), last + _REACH)
         G, c = self._linearize(last, rest)
         slack = np.minimum(G @ last, G @ rest) - c
-        is_shape = np.arange(len(c)) < len(self.constraints.outside) + len(self.constraints.inside)
+        is_shape = np.arange(len(c)) < len(self.constraints.outside)
         aim, margin = (np.where(is_shape, *pair) for pair in zip(_SHAPE, _PLANE, strict=True))
         required = c + np.minimum(margin, slack)
         lower = np.minimum(np.maximum(last - self._max_step, last + velocity - self._max_change), brake)
@@ -207,7 +204,6 @@ class MotionConstraintFilter:
             return braking
         if (np.maximum(lower - nearest, nearest - upper) > _ROUNDING * (upper - lower)).any():
             nearest = np.minimum(np.maximum(nearest, lower), upper)
-        inside = [(shape, max(-_SHAPE[1], shape.distance(rest[: shape.num_dims]))) for shape in self.constraints.inside]
         states = [(limits, max(0.0, limits.violation(rest))) for limits in self.constraints.state]
 
         def is_safe(command: np.ndarray) -> bool:
@@ -216,10 +212,8 @@ class MotionConstraintFilter:
             rest_share = self._braking(displacement)[1]
             end = command + rest_share * displacement
             checked = (command, end) if rest_share else (command,)
-            return (
-                bool((G @ end >= required).all())
-                and all(shape.distance(end[: shape.num_dims]) <= bound for shape, bound in inside)
-                and all(limits.violation(output) <= bound for limits, bound in states for output in checked)
+            return bool((G @ end >= required).all()) and all(
+                limits.violation(output) <= bound for limits, bound in states for output in checked
             )
 
         if is_safe(nearest):
@@ -246,11 +240,6 @@ class MotionConstraintFilter:
             normal, bound = shape.separate(first, last)
             if not bound - min(normal @ first, normal @ last) <= max(-shape.distance(first), rounding):
                 return False
-        for shape in constraints.inside:
-            # The distance is convex: if it decreases at the end of a line, it decreases along the whole line.
-            distance, normal = shape.surface(rest[: shape.num_dims])
-            if not (distance <= rounding or normal @ displacement[: shape.num_dims] <= 0.0):
-                return False
         return all(
             limits.violation(output) <= max(limits.violation(pose), rounding)
             for limits in constraints.state
@@ -274,12 +263,11 @@ class MotionConstraintFilter:
     def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return constraints G y ≥ c, G (F, O) and c (F,), for the path from the last command to the end of braking."""
         constraints = self.constraints
-        shapes = (*constraints.outside, *constraints.inside)
+        shapes = constraints.outside
         rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
         for k, shape in enumerate(shapes):
-            sign, D = 1.0 if k < len(constraints.outside) else -1.0, shape.num_dims
-            half_space = shape.separate(last[:D], rest[:D]) if sign > 0.0 else shape.half_space(last[:D])
-            rows[k, :D], bounds[k] = sign * half_space[0], sign * half_space[1]
+            D = shape.num_dims
+            rows[k, :D], bounds[k] = shape.separate(last[:D], rest[:D])
         states = [limits.linearize(last) for limits in constraints.state]
         G, c = zip((rows, bounds), (constraints.linear.G, constraints.linear.c), *states, strict=True)
         return np.concatenate(G), np.concatenate(c)
@@ -287,38 +275,19 @@ class MotionConstraintFilter:
     def _nearest(
         self, desired: np.ndarray, G: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray
     ) -> np.ndarray | None:
-        """Return the command (O,) nearest to the desired one with G y ≥ c, in box and `inside` shapes, or None."""
-        cuts_G, cuts_c, command = G, c, desired
-        for _ in range(_CUTS):
-            missing = cuts_c - cuts_G @ desired
-            below, above = lower - desired, upper - desired
-            if max(missing.max(initial=-1.0), below.max(), -above.min()) > 0.0:
-                is_box = np.isfinite(below)  # the upper side is then finite too
-                rows = np.concatenate([cuts_G, self._identity[is_box]])
-                low = np.append(missing, below[is_box])
-                high = np.append(np.full(len(missing), np.inf), above[is_box])
-                try:
-                    move, _ = solve_least_norm(rows, low, high)
-                except UnsolvableError:
-                    return None if cuts_c is c else command
-                command = desired + move
-            cuts = self._cut(command)
-            if not cuts:
-                return command
-            cuts_G = np.concatenate([cuts_G, [row for row, _ in cuts]])
-            cuts_c = np.append(cuts_c, [bound for _, bound in cuts])
-        return command
-
-    def _cut(self, command: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """Return (row, bound) of half-spaces that contain the `inside` shapes but not a command outside of them."""
-        cuts = []
-        for shape in self.constraints.inside:
-            distance, normal = shape.surface(command[: shape.num_dims])
-            if distance > -_SHAPE[1]:
-                row = np.zeros(self.num_outputs)
-                row[: shape.num_dims] = -normal
-                cuts.append((row, float(row @ command) + distance + CLEARANCE))
-        return cuts
+        """Return the command (O,) nearest to the desired one with G y ≥ c in the box, or None if there is none."""
+        missing, below, above = c - G @ desired, lower - desired, upper - desired
+        if max(missing.max(initial=-1.0), below.max(), -above.min()) <= 0.0:
+            return desired
+        is_box = np.isfinite(below)  # the upper side is then finite too
+        rows = np.concatenate([G, self._identity[is_box]])
+        low = np.append(missing, below[is_box])
+        high = np.append(np.full(len(missing), np.inf), above[is_box])
+        try:
+            move, _ = solve_least_norm(rows, low, high)
+        except UnsolvableError:
+            return None
+        return desired + move
 
 
 def _finite(bounds: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ The six limits of a bound are [translational, rotational], along and about the c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -258,6 +258,39 @@ def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
     if not wrench[2] >= min_force:  # for NaN too
         return np.zeros(2)
     return np.array([-wrench[4], wrench[3]]) / wrench[2]
+
+
+@dataclass
+class ContactPointMean:
+    """Mean of the points of contact of a tool on a fixed surface, a running and then an exponential mean.
+
+        n' = min(n + 1, N),  m' = m + (p + c − m) / n'   if f_z ≥ min_force, otherwise unchanged
+
+    p is the tool's position in x and y, and c its center of pressure. A plug on a rim tips between two points of
+    contact, each of which is up to a quarter turn beside the direction of the rim's center. Their mean shows it.
+
+    Attributes:
+        min_force: Force along z below which a sample is not used [N], positive.
+        largest: Number N of samples, at least 1.
+        mean: Mean m, (2,) [m].
+        count: Number n of samples in the mean; 0 before the first contact.
+    """
+
+    min_force: float
+    largest: float
+    mean: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    count: float = 0.0
+
+    def add(self, pose: np.ndarray, wrench: np.ndarray) -> None:
+        """Add a sample, if it is finite: pose (6,) of the tool center, and wrench (6,) about it, force first."""
+        if wrench[2] >= self.min_force and is_finite(wrench) and is_finite(pose):
+            self.count = min(self.count + 1.0, self.largest)
+            point = pose[:2] + center_of_pressure(wrench, self.min_force)
+            self.mean = self.mean + (point - self.mean) / self.count
+
+    def relative_to(self, pose: np.ndarray) -> np.ndarray:
+        """Return the mean relative to the tool center at `pose` (6,), (2,) [m]; zero before the first contact."""
+        return self.mean - pose[:2] if self.count else np.zeros(2)
 
 
 def external_wrench(

@@ -3,5 +3,5 @@ from .law import Law as Law
 from .law import Stepper as Stepper
 from .primitive import PrimitiveLaw as PrimitiveLaw
 from .primitive import StateProgress as StateProgress
-from .skill import load_law as load_law
+from .primitive import load_law as load_law
 from .template_law import TemplateLaw as TemplateLaw

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +17,7 @@ from guiderail.models.common.transforms import POSE_SIZE, angle_between, nearest
 from guiderail.models.control.command_filters import CommandLaw
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws.law import Command, Law, checked_vector
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, UnsolvableError
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError, make_kernel
 
 HISTORY_SOURCES = ("commanded", "measured")
 
@@ -251,3 +253,35 @@ class PrimitiveLaw(Law):
         spread = np.zeros(self.num_outputs)
         spread[self.outputs] = action
         return spread
+
+
+SKILL_FILE, PRIMITIVE_FILE = "skill.json", "primitive.npz"
+
+
+def load_law(folder: Path | str) -> PrimitiveLaw:
+    """Return the law of the guidance in a folder that ``guiderail export`` has written.
+
+    Raises:
+        InputError: If the folder has no exported skill with a movement primitive.
+    """
+    folder = Path(folder)
+    try:
+        skill = json.loads((folder / SKILL_FILE).read_text(encoding="utf-8"))
+        settings = skill["primitive"]
+        with np.load(folder / PRIMITIVE_FILE) as data:
+            arrays = {name: data[name] for name in ("times", "means", "covariances", "G", "c", "gains")}
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{folder} is no exported skill ({error}): write it with guiderail export") from error
+    primitive = LcNsKmp(
+        ReferenceTrajectory(arrays["times"], arrays["means"], arrays["covariances"]),
+        kernel=make_kernel(settings["kernel"], settings["length_scale"]),
+        constraints=LinearConstraints(arrays["G"], arrays["c"]),
+        **{key: settings[key] for key in ("lambda_", "beta", "horizon", "history", "history_variance")},
+    )
+    return PrimitiveLaw(
+        primitive,
+        arrays["gains"],
+        outputs=[entry["output"] for entry in skill["action"]],
+        history_source=settings["history_source"],
+        near=primitive.reference.means[0] if primitive.num_outputs == POSE_SIZE else None,
+    )

@@ -11,7 +11,7 @@ from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.laws.law import Command, Law
-from guiderail.models.templates.geometry import Frames
+from guiderail.models.templates.parts import Frames
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 
 

@@ -92,61 +92,6 @@ def _conditioned(
     return history_map, K
 
 
-class KernelBasis:
-    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on a few of its inputs (pivots).
-
-    Args:
-        kernel: Kernel k.
-        inputs: Inputs (N, I) that the features represent up to rounding.
-    """
-
-    def __init__(self, kernel: Kernel, inputs: np.ndarray):
-        self._kernel = kernel
-        self._pivots = np.zeros((0, inputs.shape[1]))
-        self._triangle = np.zeros((0, 0), dtype=_Extended)
-        self.extend(inputs)
-
-    @property
-    def size(self) -> int:
-        """Number of features r."""
-        return len(self._pivots)
-
-    def features(self, inputs: np.ndarray) -> np.ndarray:
-        """Compute features (n, r) at `inputs` (n, I)."""
-        return self._extended_features(inputs).astype(float)
-
-    def residual(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Compute k(ζ, ζ) − ‖f(ζ)‖² (n,), the variance at inputs (n, I) that their features (n, r) do not represent."""
-        prior = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs])
-        return prior - (features**2).sum(axis=1)
-
-    def extend(self, inputs: np.ndarray) -> bool:
-        """Add features until `inputs` (n, I) are represented; return True if any were added."""
-        inputs = inputs.astype(_Extended)
-        F = self._extended_features(inputs)
-        residual = self.residual(inputs, F)
-        # Larger than the tolerance of `_pivoted_cholesky`: data hardly depend on the weight of a feature below 3e-8.
-        tolerance = 1e-15
-        before = self.size
-        while len(inputs) and residual.max() > tolerance:
-            pivot = int(np.argmax(residual))
-            column = (self._kernel(inputs, inputs[pivot : pivot + 1])[:, 0] - F @ F[pivot]) / np.sqrt(residual[pivot])
-            grown = np.zeros((self.size + 1, self.size + 1), dtype=_Extended)
-            grown[:-1, :-1], grown[-1, :-1], grown[-1, -1] = self._triangle, F[pivot], column[pivot]
-            self._triangle = grown
-            self._pivots = np.vstack([self._pivots, inputs[pivot].astype(float)])
-            F = np.column_stack([F, column])
-            residual = residual - column**2
-            residual[pivot] = 0
-        return self.size > before
-
-    def _extended_features(self, inputs: np.ndarray) -> np.ndarray:
-        pivots, inputs = self._pivots.astype(_Extended), inputs.astype(_Extended)
-        if not len(pivots):
-            return np.zeros((len(inputs), 0), dtype=_Extended)
-        return _solve_lower(self._triangle, self._kernel(pivots, inputs)).T
-
-
 def _cholesky(A: np.ndarray) -> np.ndarray:
     """Compute the lower Cholesky factor in the precision of A (LAPACK is limited to double precision)."""
     L = np.zeros_like(A)

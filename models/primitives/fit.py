@@ -1,12 +1,11 @@
-"""Selection of mixture, kernel and regularization by leave-one-out cross-validation.
+"""Selection of mixture, length scale and regularization by leave-one-out cross-validation.
 
 A kernel that is too wide cuts corners. A kernel that is too narrow does not smooth the motion. A regularization in the
 wrong unit pulls the motion towards zero. All three increase the error of reproducing one demonstration from the others.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
-from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
+from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.mixture import information_criteria, thinned
 from guiderail.models.primitives.reference import ReferenceTrajectory
@@ -54,10 +53,8 @@ class Selection:
 
     reference: ReferenceTrajectory  # reference of all demonstrations
     components: int  # number of components C of its mixture
-    kernel: Kernel
-    length_scale: float  # ℓ of the kernel [unit of the input]
+    kernel: SquaredExponential
     lambda_: float  # λ = β
-    beta: float
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
     criteria: dict[int, float]  # Bayesian information criterion by number of components
     candidates: tuple[Candidate, ...]  # all compared candidates
@@ -70,7 +67,7 @@ class Selection:
 
     def primitive(self, **arguments: Any) -> LcNsKmp:
         """Build the selected primitive; `arguments` of `LcNsKmp` complete or replace the selected ones."""
-        selected = {"kernel": self.kernel, "lambda_": self.lambda_, "beta": self.beta}
+        selected = {"kernel": self.kernel, "lambda_": self.lambda_, "beta": self.lambda_}
         return LcNsKmp(self.reference, **{**selected, **arguments})
 
 
@@ -78,35 +75,24 @@ def fit(
     demonstrations: Demonstrations,
     *,
     components: int | None = None,
-    kernel: str = DEFAULT_KERNEL,
-    length_scale: float | None = None,
-    kernel_parameters: Mapping[str, float] | None = None,
-    lambda_: float | None = None,
     horizon: int = 40,
-    num_steps: int | None = None,
     floor: float | np.ndarray = 0.0,
-    seed: int = 0,
     log: Callable[[str], object] | None = None,
 ) -> Selection:
-    """Select components, kernel and regularization by leave-one-out cross-validation.
+    """Select components, length scale and regularization by leave-one-out cross-validation.
 
-    The selected number of components has the least Bayesian information criterion. Kernel and regularization are taken
-    from a grid relative to the motion's duration and size. A candidate qualifies if its error is within a standard
-    error of the best error and its motion without actions stays within the demonstrations' spread (`MIN_SHARE`). The
-    strongest regularization that qualifies is selected, and for this regularization the widest kernel: the motion is as
-    smooth as the demonstrations allow. If no candidate qualifies, the one with the largest `share` is selected.
+    The selected number of components has the least Bayesian information criterion. Length scale and regularization are
+    taken from a grid relative to the motion's duration and size. A candidate qualifies if its error is within a
+    standard error of the best error and its motion without actions stays within the demonstrations' spread
+    (`MIN_SHARE`). The strongest regularization that qualifies is selected, and for this regularization the widest
+    kernel: the motion is as smooth as the demonstrations allow. If no candidate qualifies, the one with the largest
+    `share` is selected.
 
     Args:
         demonstrations: At least three demonstrations.
         components: Number of components C; selected by default.
-        kernel: Name of the kernel.
-        length_scale: ℓ of the kernel [unit of the input]; selected by default.
-        kernel_parameters: Further parameters of the kernel, as in `make_kernel`.
-        lambda_: λ = β; selected by default.
         horizon: Horizon H of the intended primitive [steps].
-        num_steps: As in `ReferenceTrajectory.from_demonstrations`.
         floor: As in `ReferenceTrajectory.from_demonstrations`.
-        seed: As in `ReferenceTrajectory.from_demonstrations`.
         log: Function that receives sentences on the progress.
 
     Raises:
@@ -117,105 +103,65 @@ def fit(
             f"cross-validation needs at least three demonstrations, and there are {demonstrations.num_demonstrations}: "
             "record more"
         )
-    resampled = demonstrations.resampled(num_steps)
+    resampled = demonstrations.resampled()
     times, outputs = resampled.times[0], np.stack(resampled.outputs)
     if len(times) < 4 * _COMPONENTS[0]:
         raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
-    mixture_steps = None
-    if len(times) > LONG:
-        mixture_steps = max(_MIXTURE_STEPS, 4 * (components or 0))
-    at = thinned(len(times), mixture_steps)
+    mixture_steps = max(_MIXTURE_STEPS, 4 * (components or 0)) if len(times) > LONG else None
+    at, say = thinned(len(times), mixture_steps), log or (lambda sentence: None)
     counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(at) // 4]
-    say = log or (lambda text: None)
     say(f"fitting mixtures of {', '.join(map(str, counts))} components to {len(at)} of {len(times)} steps")
-    criteria = information_criteria(times[at], outputs[:, at], counts, seed)
+    criteria = information_criteria(times[at], outputs[:, at], counts, seed=0)
     components = min(criteria, key=lambda count: criteria[count])
 
-    reference = ReferenceTrajectory.from_demonstrations(
-        resampled, components, seed, floor=floor, mixture_steps=mixture_steps
-    )
-    folds = []
+    def fitted(recorded: Demonstrations) -> ReferenceTrajectory:
+        return ReferenceTrajectory.from_demonstrations(recorded, components, floor=floor, mixture_steps=mixture_steps)
+
+    reference, folds = fitted(resampled), []
     for m in range(len(outputs)):
         say(f"leaving out demonstration {m + 1} of {len(outputs)}, with {components} components")
-        fold = Demonstrations(times, np.delete(outputs, m, axis=0))
-        folds.append(
-            ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor, mixture_steps=mixture_steps)
-        )
+        folds.append(fitted(Demonstrations(times, np.delete(outputs, m, axis=0))))
     say("comparing kernels and regularizations")
-    make = partial(make_kernel, kernel, parameters=kernel_parameters)
-    candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
+    candidates = _validate(reference, folds, outputs, horizon, _grid(resampled))
     selected = _select(candidates)
-    primitive = LcNsKmp(
-        reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon, max_deviation=np.inf
-    )
-    share = share_within_spread(primitive)
+    kernel, lambda_ = SquaredExponential(selected.length_scale), selected.lambda_
+    share = share_within_spread(reference, kernel, lambda_, lambda_, horizon, evaluated=LONG)
     thinning = ""
     if len(at) < len(times):
         thinning = f" The mixture was fitted to {len(at)} evenly spaced steps of {len(times)}."
-    return Selection(
-        reference=reference,
-        components=components,
-        kernel=primitive.kernel,
-        length_scale=selected.length_scale,
-        lambda_=selected.lambda_,
-        beta=selected.lambda_,
-        share=share,
-        criteria=criteria,
-        candidates=candidates,
-        why=_explain(components, criteria, selected, candidates, share, times) + thinning,
-    )
+    why = _explain(components, criteria, selected, candidates, share, times) + thinning
+    return Selection(reference, components, kernel, lambda_, share, criteria, candidates, why)
 
 
-def share_within_spread(primitive: LcNsKmp) -> float:
+def share_within_spread(
+    reference: ReferenceTrajectory,
+    kernel: Kernel,
+    lambda_: float,
+    beta: float,
+    horizon: int = 40,
+    evaluated: int = _EVALUATED,
+) -> float:
     """Compute the share of steps at which the motion without actions is within one standard deviation of the mean.
 
     One standard deviation is the ellipsoid of the reference's covariance. If the share is below `MIN_SHARE`, the kernel
-    is too wide for the demonstrations or the regularization is too strong; `fit` selects both. Of a long motion without
-    a history, 400 evenly spaced steps are evaluated.
+    is too wide for the demonstrations or the regularization is too strong; `fit` selects both. The arguments are those
+    of `LcNsKmp` without a history, and the largest number of evaluated steps, which are evenly spaced.
     """
-    if not primitive.history and primitive.reference.num_steps > LONG:
-        steps = thinned(primitive.reference.num_steps, LONG)
-        motion = np.array([primitive.predict(step, None, None).output for step in steps.tolist()])
-        return float(_within(primitive.reference, motion, steps).mean())
-    return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
-
-
-def estimated_share(
-    reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int = 40
-) -> float:
-    """Estimate `share_within_spread` of a primitive without a history from forty of its steps.
-
-    The arguments are those of `LcNsKmp`.
-    """
-    steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    motion = outputs_at(reference, kernel, lambda_ + beta, horizon, steps)
+    steps = thinned(reference.num_steps, evaluated)
+    parts = np.array_split(steps, -(-len(steps) // _EVALUATED))  # the matrices of all steps may need 200 MB
+    motion = np.concatenate([outputs_at(reference, kernel, lambda_ + beta, horizon, part) for part in parts])
     return float(_within(reference, motion, steps).mean())
 
 
-def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
-    """Compute the outputs (N, O) of a primitive without actions; a history starts at the first mean."""
-    reference = primitive.reference
-    past = np.tile(reference.means[0], (primitive.history, 1))
-    motion = np.zeros_like(reference.means)
-    for step in range(reference.num_steps):
-        motion[step] = primitive.predict(step, None, past if primitive.history else None).output
-        if primitive.history:
-            past = np.vstack([past[1:], motion[step]])
-    return motion
+def _within(reference: ReferenceTrajectory, motion: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    return squared_distances(reference.covariances[steps], motion - reference.means[steps]) <= 1.0
 
 
-def _within(reference: ReferenceTrajectory, motion: np.ndarray, steps: Any) -> np.ndarray:
-    error = motion - reference.means[steps]
-    return squared_distances(reference.covariances[steps], error) <= 1.0
-
-
-def _grid(resampled: Demonstrations, length_scale: float | None, lambda_: float | None) -> list[tuple[float, float]]:
-    """Return length scales and ħ to try, relative to the motion's duration and size unless they are fixed."""
+def _grid(resampled: Demonstrations) -> list[tuple[float, float]]:
+    """Return length scales and ħ to try, relative to the motion's duration and size."""
     duration = float(resampled.times[0][-1] - resampled.times[0][0])
     size = float(np.sqrt((np.stack(resampled.outputs) ** 2).mean(axis=(0, 1)).max())) or 1.0
-    lengths = [length * duration for length in _LENGTHS] if length_scale is None else [length_scale]
-    strengths = [hbar / size**2 for hbar in _REGULARIZATIONS] if lambda_ is None else [2.0 * lambda_]
-    return [(length, hbar) for length in lengths for hbar in strengths]
+    return [(length * duration, hbar / size**2) for length in _LENGTHS for hbar in _REGULARIZATIONS]
 
 
 def _validate(
@@ -224,11 +170,10 @@ def _validate(
     outputs: np.ndarray,
     horizon: int,
     grid: Sequence[tuple[float, float]],
-    make: Callable[[float], Kernel],
 ) -> tuple[Candidate, ...]:
     """Return the candidates of a grid with their errors (see `Candidate`)."""
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    kernels = [make(length_scale) for length_scale, _ in grid]
+    kernels = [SquaredExponential(length_scale) for length_scale, _ in grid]
     motions = [outputs_at(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
     shares = np.array([_within(reference, motion, steps).mean() for motion in motions])
     is_within = shares >= min(MIN_SHARE, shares.max())

@@ -24,12 +24,13 @@ from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.deviation import MAX_DEVIATION, check_constraints, check_deviation
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential, check_kernel
-from guiderail.models.primitives.qp import UnsolvableError, find_solver
+from guiderail.models.primitives.qp import UnsolvableError
 from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
 
 HISTORY, HORIZON = 10, 40
 """Default numbers of past outputs P of sKGRL, and of future points H with constraints."""
+_CACHE_BYTES = 2**29  # memory limit of a primitive's factored steps [bytes]; above it, those factored first are dropped
 
 
 class LcNsKmp:
@@ -47,8 +48,6 @@ class LcNsKmp:
         history: Number of past outputs P that the motion passes through (sKGRL); 0 for none (KGRL).
         history_variance: Variance ρ of the past outputs [output²], positive.
         constraints: Constraints G y ≥ c at every future point; none by default.
-        solver: "daqp", "piqp" or "osqp".
-        cache_bytes: Memory limit of the factored steps [bytes]. Above the limit, the steps factored first are dropped.
         max_deviation: Largest accepted `deviation` of a motion that is not within `MAX_MISS` (`check_deviation`).
 
     Raises:
@@ -59,7 +58,7 @@ class LcNsKmp:
         UserWarning: If `deviation` exceeds one.
 
     Attributes:
-        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: Arguments.
+        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints: Arguments.
         deviation: RMS distance of the motion without actions from the reference mean [standard deviations].
         cached_bytes: Memory of the factored steps [bytes].
     """
@@ -74,8 +73,6 @@ class LcNsKmp:
         history: int = 0,
         history_variance: float = 1e-6,
         constraints: LinearConstraints | None = None,
-        solver: str = "daqp",
-        cache_bytes: int = 2**29,
         max_deviation: float = MAX_DEVIATION,
     ):
         for name, value in (("lambda_", lambda_), ("beta", beta)):
@@ -94,10 +91,8 @@ class LcNsKmp:
         self.lambda_, self.beta = float(lambda_), float(beta)
         self.horizon, self.history, self.history_variance = int(horizon), int(history), float(history_variance)
         self.constraints = constraints
-        self.solver = solver
-        self._solve = find_solver(solver)
         self._cache: OrderedDict[int, StepFactor] = OrderedDict()
-        self._cache_bytes, self.cached_bytes = cache_bytes, 0
+        self.cached_bytes = 0
         self._shared_features: WindowFeatures | None = None
         self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
@@ -163,41 +158,6 @@ class LcNsKmp:
             is_constrained[rows] = violates
         return BatchPrediction(outputs, is_constrained, is_solved)
 
-    def predict_at(
-        self,
-        inputs: np.ndarray,
-        means: np.ndarray,
-        covariances: np.ndarray,
-        null_space_action: np.ndarray | None = None,
-        history: np.ndarray | None = None,
-        history_inputs: np.ndarray | None = None,
-    ) -> Prediction:
-        """Compute the output at inputs that are not on the reference's clock, such as a state; nothing is cached.
-
-        Args:
-            inputs: Inputs of a window of any length, (H+1,) or (H+1, I), the executed point first.
-            means: Reference means at these inputs (H+1, O).
-            covariances: Reference covariances at these inputs (H+1, O, O).
-            null_space_action: ξ̂ (O,), as in `predict`.
-            history: (P, O), as in `predict`.
-            history_inputs: Inputs of the history, (P,) or (P, I); None if P = 0.
-
-        Raises:
-            InputError: As `predict`; also if a covariance is not symmetric and positive definite, or the constraints
-                differ from step to step and therefore need a clock.
-            UnsolvableError: As `predict`.
-        """
-        if self.constraints.num_steps is not None:
-            raise InputError("constraints that differ from step to step need a clock: use predict")
-        x = self._stack(null_space_action, history)
-        inputs = as_numbers(inputs, "inputs")
-        past = inputs[:0] if history_inputs is None else as_numbers(history_inputs, "history_inputs")
-        window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
-        if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
-            raise InputError("inputs, means and covariances must be finite")
-        features = window_features(self.kernel, past, inputs, self._history_noise)
-        return self._finish(StepFactor(window, features, self.lambda_, self.beta), x)
-
     def predict_window(
         self,
         step: int,
@@ -231,34 +191,12 @@ class LcNsKmp:
         free = factor.constraint_map @ x
         if (free >= factor.lower).all() and (free <= factor.upper).all():
             return Prediction(output, factor, x)
-        v, signed = factor.correct(free, self._solve)
+        v, signed = factor.correct(free)
         output += factor.correction_map @ v
         violation = factor.violation(output)
         if not violation <= TOLERANCE:
             raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
         return Prediction(output, factor, x, v, signed)
-
-    def modified_window(
-        self, step: int, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
-    ) -> Modification:
-        """Compute the window at a step under null-space actions at several of its points (equations 4.17 and 4.18).
-
-        With one action at `step` itself, this is the window of `predict` (equation 4.21). Between the points, actions
-        are interpolated by the function of smallest norm in the kernel's Hilbert space.
-
-        Args:
-            step: Executed point n ≥ 0; past the end, the last step.
-            at: Different steps (J,) from n … n+H, in any order.
-            null_space_actions: ξ̂ (J, O), one for each of these steps.
-            history: (P, O), as in `predict`.
-
-        Raises:
-            InputError: As `predict`; also if a step in `at` is outside of the window, or the steps are so close to each
-                other, or equal, that their kernel matrix is singular.
-            UnsolvableError: If no window within the constraints was found.
-        """
-        factor, step = self._factor(step), min(int(step), self.num_steps - 1)
-        return self._modified(factor, step, self.horizon, at, null_space_actions, history)
 
     def modified_trajectory(
         self, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
@@ -266,7 +204,9 @@ class LcNsKmp:
         """Compute the whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
 
         Problem 4.5 is solved once, over all N steps, whereas `predict` solves it for each window. The result is smooth
-        over the whole motion and within the constraints at every step. The problem is factored at the first call.
+        over the whole motion and within the constraints at every step. Between the steps of the actions, the action is
+        interpolated by the function of smallest norm in the kernel's Hilbert space. The problem is factored at the
+        first call.
 
         Args:
             at: Different steps (J,) from 0 … N−1, in any order; none for the motion without actions.
@@ -274,41 +214,29 @@ class LcNsKmp:
             history: Outputs before the first step, (P, O); None if P = 0.
 
         Raises:
-            InputError: As `modified_window`.
-            UnsolvableError: As `modified_window`.
+            InputError: As `predict`; also if a step in `at` is outside of the motion, or the steps are so close to each
+                other, or equal, that their kernel matrix is singular.
+            UnsolvableError: If no motion within the constraints was found.
         """
-        horizon = self.num_steps - 1
-        if self._whole is None:
-            past, future = self._inputs(0, horizon)
-            features = window_features(self.kernel, past, future, self._history_noise)
-            self._whole = StepFactor(self._window(0, horizon), features, self.lambda_, self.beta)
-        return self._modified(self._whole, 0, horizon, at, null_space_actions, history)
-
-    def _modified(
-        self,
-        factor: StepFactor,
-        step: int,
-        horizon: int,
-        at: ArrayLike,
-        null_space_actions: ArrayLike,
-        history: np.ndarray | None,
-    ) -> Modification:
-        x = self._stack(None, history)
+        last, x = self.num_steps - 1, self._stack(None, history)
         points = as_numbers(at, "the steps of null-space actions")
-        if points.ndim != 1 or not np.isin(points, np.arange(step, step + horizon + 1)).all():
-            raise InputError(f"null-space actions must be at steps among {step} … {step + horizon}: {brief(at)}")
+        if points.ndim != 1 or not np.isin(points, np.arange(last + 1)).all():
+            raise InputError(f"null-space actions must be at steps among 0 … {last}: {brief(at)}")
         actions = as_numbers(null_space_actions, "null-space actions").reshape(len(points), self.num_outputs)
         if not np.isfinite(actions).all():
             raise InputError("null-space actions must be finite")
-        past, future = self._inputs(step, horizon)
-        indices = points.astype(int) - step
-        action = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
-        trajectory, signed = factor.modified(x, action, self._solve)
+        past, future = self._inputs(0, last)
+        if self._whole is None:
+            features = window_features(self.kernel, past, future, self._history_noise)
+            self._whole = StepFactor(self._window(0, last), features, self.lambda_, self.beta)
+        factor, noise = self._whole, self._history_noise
+        action = window_interpolation(self.kernel, past, future, noise, points.astype(int)) @ actions
+        trajectory, signed = factor.modified(x, action)
         violation = factor.max_violation(trajectory)
         if not violation <= TOLERANCE:
             raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
         alpha = np.zeros(factor.multipliers_shape) if signed is None else factor.multipliers(signed)
-        return Modification(np.arange(step, step + horizon + 1), trajectory, alpha)
+        return Modification(trajectory, alpha)
 
     def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return R_h (O, PO), N (O, O) and r (O,) of a step's unconstrained output R_h h + N ξ̂ + r."""
@@ -390,7 +318,7 @@ class LcNsKmp:
             factor.factor_corrections()
             self._cache[step] = factor
             self.cached_bytes += factor.nbytes
-            while self.cached_bytes > self._cache_bytes and len(self._cache) > 1:
+            while self.cached_bytes > _CACHE_BYTES and len(self._cache) > 1:
                 _, oldest = self._cache.popitem(last=False)
                 self.cached_bytes -= oldest.nbytes
         return factor

@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetric
+from guiderail.models.common.arrays import as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations, num_periods
 from guiderail.models.primitives.kernels import Kernel, check_kernel
@@ -62,20 +61,27 @@ class ReferenceTrajectory:
         self.uniform = bool(np.abs(self.times - grid).max() <= 1e-12 * np.abs(self.times).max())
 
     @classmethod
+    def straight(
+        cls, start: Sequence[float], end: Sequence[float], std: float, *, num_steps: int, period: float
+    ) -> ReferenceTrajectory:
+        """Return a motion at constant speed from `start` (O,) to `end` (O,), with the standard deviation `std`.
+
+        It has `num_steps` steps of `period` [s].
+        """
+        variance = np.tile(std**2 * np.eye(len(start)), (num_steps, 1, 1))
+        return cls(period * np.arange(num_steps), np.linspace(start, end, num_steps), variance)
+
+    @classmethod
     def from_demonstrations(
         cls,
         demonstrations: Demonstrations,
         components: int | None = None,
         seed: int = 0,
-        num_steps: int | None = None,
         floor: float | np.ndarray = 0.0,
         prior_std: float | Sequence[float] | np.ndarray | None = None,
-        model: Literal["gmr", "promp"] = "gmr",
-        gap_scale: float = 1.0,
-        kernel: Kernel | None = None,
         mixture_steps: int | None = None,
     ) -> ReferenceTrajectory:
-        """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR), or fit a ProMP.
+        """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR).
 
         The covariance of a single demonstration only contains motions that the mixture averages out, such as a circling
         search. `prior_std` adds the variance that further demonstrations would have.
@@ -84,16 +90,10 @@ class ReferenceTrajectory:
             demonstrations: Demonstrations, resampled to one uniform clock of N steps if they do not have it already.
             components: Number of components C of the mixture; chosen by the Bayesian information criterion by default.
             seed: Seed of the mixture's initialization.
-            num_steps: Number of steps N, at least 2; the largest number of samples of a demonstration by default.
             floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output]. If
                 demonstrations differ by less than the resolution of a sensor or a controller, give this resolution.
             prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
                 required for one demonstration, refused for several.
-            model: "gmr", or "promp" with the default number of basis functions (`ProMp`).
-            gap_scale: Factor of the standard deviation in a gap of all recordings, positive. Exploration in the gap is
-                narrower below 1 and wider above 1. At each step the factor is `gap_scale` to the power of
-                `unobserved_share`.
-            kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
             mixture_steps: Largest number of steps, evenly chosen, to which the mixture is fitted; all by default. It is
                 regressed on all steps.
 
@@ -101,11 +101,7 @@ class ReferenceTrajectory:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
                 singular.
         """
-        if model not in ("gmr", "promp"):
-            raise InputError(f"the model of a reference is gmr or promp, not {model!r}")
-        if not 0.0 < as_number(gap_scale, "gap_scale") < np.inf:
-            raise InputError(f"gap_scale is a factor of the standard deviation and must be positive, not {gap_scale}")
-        recordings, number = demonstrations, demonstrations.num_demonstrations
+        number = demonstrations.num_demonstrations
         if prior_std is None and number == 1:
             raise InputError(
                 "a single demonstration has no variance: give prior_std, the standard deviation of each output"
@@ -115,22 +111,14 @@ class ReferenceTrajectory:
                 f"prior_std is for a single demonstration, and there are {number}, which have a variance of their own: "
                 "leave prior_std out, or use one demonstration"
             )
-        demonstrations = demonstrations.resampled(num_steps)
+        demonstrations = demonstrations.resampled()
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
-        floor = _checked_floor(floor, outputs.shape[-1])
-        if model == "promp":
-            means, covariances = ProMp.fit(demonstrations).moments(np.linspace(0.0, 1.0, len(times)))
-        else:
-            at = thinned(len(times), mixture_steps)
-            means, covariances = regress(fit_mixture(times[at], outputs[:, at], components, seed), times)
+        floor, at = _checked_floor(floor, outputs.shape[-1]), thinned(len(times), mixture_steps)
+        means, covariances = regress(fit_mixture(times[at], outputs[:, at], components, seed), times)
         covariances = covariances + np.diag(floor**2)
         if prior_std is not None:
             covariances += np.eye(len(floor)) * (interpolate_prior(prior_std, len(times), len(floor)) ** 2)[:, None]
-        reference = cls(times, means, covariances)
-        if gap_scale == 1.0:
-            return reference
-        scale = gap_scale ** unobserved_share(reference, recordings, kernel)
-        return cls(times, means, scale[:, :, None] * reference.covariances * scale[:, None, :])
+        return cls(times, means, covariances)
 
     @classmethod
     def from_promp(cls, promp: ProMp, times: np.ndarray, floor: float | np.ndarray = 0.0) -> ReferenceTrajectory:
@@ -281,32 +269,6 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
         raise InputError(f"the phases of prior_std must increase and lie from 0 to 1, not {phases.tolist()}")
     at = np.linspace(0.0, 1.0, num_steps)
     return np.column_stack([np.interp(at, phases, column) for column in deviations.T])
-
-
-def unobserved_share(
-    reference: ReferenceTrajectory, recordings: Demonstrations, kernel: Kernel | None = None
-) -> np.ndarray:
-    """Compute the epistemic variance (N, O) of a reference, as a share of the variance far from all demonstrations.
-
-    The share is the diagonal of equation 2.18 with λ_c = 1, without the factor N/λ_c, divided by k(ζ, ζ). Reference
-    points are the steps at which at least one recording has a sample. The share is close to 0 there and approaches 1 in
-    a gap that is long compared with the kernel's length scale.
-
-    Args:
-        reference: Reference of the demonstrations.
-        recordings: Recorded demonstrations, not resampled, because `Demonstrations.resampled` fills their gaps.
-        kernel: Kernel over the reference's times; `SquaredExponential()` by default.
-    """
-    from guiderail.models.primitives.kernels import SquaredExponential
-    from guiderail.models.primitives.kmp import Kmp
-
-    kernel, times = SquaredExponential() if kernel is None else kernel, reference.times
-    phases = np.concatenate([(t - t[0]) / (t[-1] - t[0]) for t in recordings.times])
-    observed = np.unique(np.rint(phases * (reference.num_steps - 1)).astype(int))
-    kmp = Kmp(times[observed], reference.means[observed], reference.covariances[observed], kernel)
-    prior = np.array([kernel(t[None], t[None])[0, 0] for t in times])
-    variances = np.einsum("noo->no", kmp.covariance(times)) / len(observed)
-    return np.clip(variances / prior[:, None], 0.0, 1.0)
 
 
 def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel: Kernel) -> ReferenceTrajectory:

@@ -10,7 +10,7 @@ from guiderail.models.common.arrays import as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.features import WindowFeatures
-from guiderail.models.primitives.qp import Solver, UnsolvableError, solve_least_norm
+from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 # Smallest singular value of the unit constraint rows, relative to the largest; smaller values are rounding errors.
 _NEGLIGIBLE = 1e-13
@@ -164,7 +164,7 @@ class StepFactor:
             self._basis, self.constraint_rows = np.zeros((A.shape[1], 0)), A[:, :0]
         self.correction_map = L @ self._basis
 
-    def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
+    def correct(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the least-norm correction of a window, given its constrained directions `constraint_map @ x` (m,).
 
         Returns:
@@ -176,11 +176,11 @@ class StepFactor:
         self.factor_corrections()
         lower, upper = self.lower - free, self.upper - free
         try:
-            return solve_least_norm(self.constraint_rows, lower, upper, solver)
+            return solve_least_norm(self.constraint_rows, lower, upper)
         except UnsolvableError:
             # If a correction hardly moves the output, rounding errors can make the scaled bounds contradict each other.
             loose = 0.5 * TOLERANCE * self._scale
-            return solve_least_norm(self.constraint_rows, lower - loose, upper + loose, solver)
+            return solve_least_norm(self.constraint_rows, lower - loose, upper + loose)
 
     def find_slack(self, x: np.ndarray) -> np.ndarray:
         """Return a mask (B,), true where every constraint is slack for x (B, PO+O)."""
@@ -235,13 +235,12 @@ class StepFactor:
         y = solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]
         return y.reshape(self._window.means.shape)
 
-    def modified(self, x: np.ndarray, action: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray | None]:
+    def modified(self, x: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Compute the window under null-space actions at several points (equation 4.18, multipliers of 4.17).
 
         Args:
             x: History, and zeros in place of the null-space action (PO+O,); `action` replaces the null-space action.
             action: Actions interpolated to every point of the window, K̂ K̲⁻¹ ξ̂ given the history, (H+1, O).
-            solver: Solver of the least-norm problem.
 
         Returns:
             The window (H+1, O), and the solver's multipliers (m,) or None if every constraint is slack.
@@ -261,7 +260,7 @@ class StepFactor:
         free = self.constraint_map @ x + along
         if (free >= self.lower).all() and (free <= self.upper).all():
             return y, None
-        v, signed = self.correct(free, solver)
+        v, signed = self.correct(free)
         return y + (solution.L @ (self._basis @ v)).reshape(action.shape), signed
 
     def max_violation(self, trajectory: np.ndarray) -> float:
@@ -360,15 +359,13 @@ class BatchPrediction:
 
 @dataclass(frozen=True)
 class Modification:
-    """Part of a motion, modified by null-space actions at several of its points.
+    """Motion that is modified by null-space actions at several of its points.
 
     Attributes:
-        steps: Steps of the reference (n,), including steps past its end.
-        trajectory: Outputs (n, O), within the constraints.
-        multipliers: Multipliers α (n, F) ≥ 0, zero where a constraint is slack.
+        trajectory: Outputs (N, O), within the constraints.
+        multipliers: Multipliers α (N, F) ≥ 0, zero where a constraint is slack.
     """
 
-    steps: np.ndarray
     trajectory: np.ndarray
     multipliers: np.ndarray
 

@@ -1,4 +1,4 @@
-"""Constraints on the commanded pose: joint limits of an arm, and distance from singular postures.
+"""Constraints on the commanded pose: joint limits of an arm.
 
 `JointRange` implements `StateConstraints` of `models/control/motion_constraints.py`; a station of an arm makes it.
 """
@@ -12,13 +12,12 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.damped_inverse import LEVER, TOOL_SCALE
+from guiderail.models.control.damped_inverse import TOOL_SCALE
 from guiderail.models.robots.inverse_kinematics import pose_error
 
 _ITERATIONS = 60  # largest number of iterations of the inverse kinematics
 _TOLERANCE = 1e-9  # largest norm of the pose error, as a scaled twist [m]
 _MAX_CHANGE = 0.5  # largest change of a joint in one iteration [rad]
-_DIFFERENCE = 1e-6  # joint step of the finite difference of a singular value [rad]
 
 
 class JointRange:
@@ -37,11 +36,9 @@ class JointRange:
         posture: Joint positions (n,) [rad] within the limits.
         margin: Distance of the command from the limits [rad], not negative: allowance for the position error of an arm
             under impedance control.
-        min_singular_value: Lower bound [m] of the singular values of the Jacobian whose rotations are scaled by
-            `LEVER`; 0 for no constraint.
 
     Raises:
-        InputError: If the posture is not within the limits and the margin, or an argument is negative or infinite.
+        InputError: If the posture is not within the limits and the margin.
     """
 
     def __init__(
@@ -51,14 +48,11 @@ class JointRange:
         tool_center: Frame,
         posture: np.ndarray,
         margin: float = 0.0,
-        min_singular_value: float = 0.0,
     ):
-        if not (0.0 <= margin < np.inf and 0.0 <= min_singular_value < np.inf):
-            raise InputError(f"margin and min_singular_value must be finite and ≥ 0: {margin}, {min_singular_value}")
         self._plant, self._reference, self._tool_center = plant, reference, tool_center
         self._context = plant.CreateDefaultContext()
         self._solve_once = lru_cache(maxsize=8)(self._solve)  # a control step requests the same poses several times
-        self._posture, self._min_singular_value = np.array(posture, dtype=float), float(min_singular_value)
+        self._posture = np.array(posture, dtype=float)
         self._lower = plant.GetPositionLowerLimits() + margin
         self._upper = plant.GetPositionUpperLimits() - margin
         if not ((self._lower < self._posture) & (self._posture < self._upper)).all():
@@ -100,31 +94,16 @@ class JointRange:
         if q is None:
             return np.zeros((0, POSE_SIZE)), np.zeros(0)
         inverse = np.linalg.pinv(self._jacobian(q)) @ (TOOL_SCALE[:, None] * _twist_of_change(output))
-        rows, bounds = [inverse, -inverse], [self._lower - q, q - self._upper]
-        if self._min_singular_value:
-            value, gradient = self._singular_value(q)
-            rows.append((gradient @ inverse)[None])
-            bounds.append(np.array([self._min_singular_value - value]))
-        G, c = np.concatenate(rows), np.concatenate(bounds)
+        G, c = np.concatenate([inverse, -inverse]), np.concatenate([self._lower - q, q - self._upper])
         norms = np.linalg.norm(G, axis=1)
         is_used = norms > 1e-9  # a joint that does not move has no constraint
         G = G[is_used] / norms[is_used, None]
         return G, G @ output + c[is_used] / norms[is_used]
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the largest violation [rad] at a pose (6,): negative inside, infinite if the pose cannot be reached.
-
-        The violation of a joint limit is an angle. The violation of the singular value [m] is divided by `LEVER` [m],
-        so that it is an angle too.
-        """
+        """Return the largest violation [rad] at a pose (6,), negative inside, infinite if the pose is out of reach."""
         q = self.solve(output)
-        if q is None:
-            return np.inf
-        violation = float(np.maximum(self._lower - q, q - self._upper).max())
-        if self._min_singular_value:
-            sigma = np.linalg.svd(self._jacobian(q), full_matrices=False)[1]
-            violation = max(violation, (self._min_singular_value - float(sigma[-1])) / LEVER)
-        return violation
+        return np.inf if q is None else float(np.maximum(self._lower - q, q - self._upper).max())
 
     def _jacobian(self, q: np.ndarray) -> np.ndarray:
         """Set the arm to `q` and return the scaled Jacobian (6, n), rotation first."""
@@ -133,14 +112,6 @@ class JointRange:
             self._context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._reference, self._reference
         )
         return TOOL_SCALE[:, None] * J
-
-    def _singular_value(self, q: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the smallest singular value of the scaled Jacobian, and its gradient (n,)."""
-        J = self._jacobian(q)
-        U, sigma, WT = np.linalg.svd(J, full_matrices=False)
-        moved = [self._jacobian(q + step) for step in _DIFFERENCE * np.eye(len(q))]
-        gradient = np.array([U[:, -1] @ ((each - J) / _DIFFERENCE) @ WT[-1] for each in moved])
-        return float(sigma[-1]), gradient
 
 
 def _twist_of_change(pose: np.ndarray) -> np.ndarray:

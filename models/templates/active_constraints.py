@@ -16,7 +16,8 @@ from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.control import shapes
-from guiderail.models.templates.geometry import (
+from guiderail.models.templates.parts import (
+    ACTIVE_CONSTRAINTS,
     WORLD,
     Frames,
     StatePart,
@@ -28,9 +29,12 @@ from guiderail.models.templates.geometry import (
     pose_distance,
     pose_in,
     position_in,
+    register,
+    require,
+    require_finite,
+    require_three,
     with_position_in,
 )
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, require, require_finite, require_three
 
 UNBOUNDED = 1e3  # radius beyond the reach of any robot [m]
 

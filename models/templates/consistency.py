@@ -37,7 +37,7 @@ from guiderail.models.templates.active_constraints import (
     TiltConstraint,
     TiltLimits,
 )
-from guiderail.models.templates.geometry import chord_angle, matrix_deg
+from guiderail.models.templates.parts import chord_angle, matrix_deg
 
 CLEAR = 1e-6  # smallest violation that counts as a contradiction, far above rounding [m or rad]
 STEPS = 400  # largest number of gradient steps to the point nearest to all sets

@@ -7,8 +7,19 @@ import numpy as np
 from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, axis_angle_rotation
-from guiderail.models.templates.geometry import WORLD, Frames, StatePart, axes, bearing, position_in, tilt_axis
-from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
+from guiderail.models.templates.parts import (
+    INPUT_MAPPINGS,
+    WORLD,
+    Frames,
+    StatePart,
+    axes,
+    bearing,
+    position_in,
+    register,
+    require,
+    require_three,
+    tilt_axis,
+)
 
 TOOL = "tool"
 

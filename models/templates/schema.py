@@ -31,9 +31,8 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml, parse_yaml
 from guiderail.models.templates.active_constraints import ActiveConstraint
-from guiderail.models.templates.geometry import WORLD
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 from guiderail.models.templates.mappings import TOOL, InputMapping
+from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES, WORLD
 from guiderail.models.templates.template import SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates.transitions import TransitionDistance
 

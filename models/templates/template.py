@@ -13,8 +13,8 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.control.wrench import norm_limits
 from guiderail.models.templates.active_constraints import ActiveConstraint, ConstraintGroup, Outside, group_constraints
 from guiderail.models.templates.consistency import describe, find_contradiction
-from guiderail.models.templates.geometry import WORLD, Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
+from guiderail.models.templates.parts import WORLD, Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]

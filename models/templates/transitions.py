@@ -11,8 +11,19 @@ from typing_extensions import override
 
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.active_constraints import TiltLimits
-from guiderail.models.templates.geometry import WORLD, Frames, StatePart, axes, chord_angle, matrix_deg, position_in
-from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, require, require_three
+from guiderail.models.templates.parts import (
+    TRANSITION_DISTANCES,
+    WORLD,
+    Frames,
+    StatePart,
+    axes,
+    chord_angle,
+    matrix_deg,
+    position_in,
+    register,
+    require,
+    require_three,
+)
 
 
 class TransitionDistance(StatePart, ABC):

@@ -20,7 +20,7 @@ from guiderail.models.templates.active_constraints import (
     TiltLimits,
 )
 from guiderail.models.templates.consistency import find_contradiction
-from guiderail.models.templates.geometry import Frames, pose_distance
+from guiderail.models.templates.parts import Frames, pose_distance
 from guiderail.models.templates.template import SharedControlTemplate, TemplateState
 from guiderail.models.templates.transitions import AxisDistance, Distance, Height, TiltToGo
 

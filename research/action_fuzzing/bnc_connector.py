@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.tools.evaluation.episode import EnvCallback, Transition
 from research.action_fuzzing.campaign import Campaign, Case
 

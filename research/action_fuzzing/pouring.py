@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
-from guiderail.diagrams.tasks.pouring.task import scripted_pour
+from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET, scripted_pour
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.evaluation.baselines import BaselineFactory, bang_bang, uniform_random
 from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn

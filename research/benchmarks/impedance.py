@@ -18,7 +18,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.tools.evaluation.baselines import make_baseline

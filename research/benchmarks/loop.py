@@ -22,7 +22,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
 from guiderail_hardware.drivers.clock import set_realtime_priority
 from guiderail_hardware.drivers.lcm import IiwaDriver

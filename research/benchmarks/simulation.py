@@ -21,17 +21,17 @@ from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, BncWorkcell
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
-from guiderail.systems.body_poses import MeasuredPose
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController
 from guiderail.systems.contact_detector import ContactDetector
+from guiderail.systems.poses import MeasuredPose
 from guiderail.systems.recorder import Recorder
-from guiderail.systems.support.last_valid_pose import LastValidPose
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.support.last_valid import LastValidPose
+from guiderail.systems.wrench_sensors import WrenchSensor
 from guiderail.systems.wrench_signals import ForceMonitor, PoseWrench
 from research.benchmarks import with_progress
 

@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.transforms import MM
 from guiderail.tools.visualization.figures import new_figure, save_figure
 from research.benchmarks import with_progress

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import make_template
+from guiderail.diagrams.tasks.pouring import make_template
 from guiderail.models.templates.drawing import draw, list_edges, state_lines
 from guiderail.tools.tables import write_table
 

@@ -10,8 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import make_template
-from guiderail.diagrams.tasks.pouring.task import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT
+from guiderail.diagrams.tasks.pouring import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT, make_template
 from guiderail.models.templates.drawing import draw, state_lines
 from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.environments import make_environment

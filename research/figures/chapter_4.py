@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.patches import Ellipse, Rectangle
 
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.models.primitives.mixture import fit_mixture

@@ -11,10 +11,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT
+from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.environments import make_environment

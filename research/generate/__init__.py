@@ -13,16 +13,16 @@ from guiderail.models.primitives import Demonstrations
 
 def _objects(name: str, dimensions: str) -> Callable[..., None]:
     def write(*folder: Path) -> None:
-        sdf = import_module(f"guiderail.models.objects.{name}.sdf")
-        for file, content in sdf.files(getattr(sdf, dimensions)()).items():
-            Path(*(folder or (sdf.FOLDER,)), file).write_text(content)
+        model = import_module(f"guiderail.models.objects.{name}")
+        for file, content in model.files(getattr(model, dimensions)()).items():
+            Path(*(folder or (model.FOLDER,)), file).write_text(content)
 
     return write
 
 
 def _passage(*folder: Path) -> None:
-    passage = import_module("guiderail.models.objects.narrow_passage.demonstrations")
-    passage.generate().save(folder[0] / passage.PATH.name if folder else passage.PATH)
+    path = import_module("guiderail.models.objects.narrow_passage").PATH
+    import_module("research.generate.narrow_passage").generate().save(folder[0] / path.name if folder else path)
 
 
 def _session(name: str) -> Callable[..., None]:
@@ -40,7 +40,7 @@ def _mixtures(*folder: Path) -> None:
     )
     arrays: dict[str, np.ndarray] = {}
     for path, components in [
-        (passage.demonstrations.PATH, passage.COMPONENTS),
+        (import_module("guiderail.models.objects.narrow_passage").PATH, passage.COMPONENTS),
         *((path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()),
     ]:
         demonstrations = Demonstrations.load(path).resampled()

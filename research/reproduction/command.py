@@ -41,4 +41,5 @@ def main(arguments: list[str]) -> None:
                 store(runs, args.out)
         for file in store(runs, args.out):
             print(file)
-    print(write_report(TABLES))
+    for path in write_report(TABLES):
+        print(path)

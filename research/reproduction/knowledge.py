@@ -5,7 +5,7 @@ import inspect
 import textwrap
 from typing import Any
 
-from guiderail.diagrams.tasks.pouring import task
+from guiderail.diagrams.tasks import pouring as task
 from guiderail.models.templates import load_template
 
 REWARD_CONSTANTS = ("TERMINAL", "APPROACH", "NEAR_BONUS", "TILT", "NEAR")  # constants of equations 3.5 to 3.10

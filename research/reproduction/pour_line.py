@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.tasks.pouring.options import POSITION_SCALE
-from guiderail.diagrams.tasks.pouring.task import AIM, STATE, scripted_pour_aimed
+from guiderail.diagrams.tasks.pouring import AIM, POSITION_SCALE, STATE, scripted_pour_aimed
 from guiderail.tools.environments import make_environment
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import table_text

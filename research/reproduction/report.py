@@ -22,6 +22,7 @@ from research.reproduction.tables import TABLES
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "research" / "results"
 PAGE = ROOT / "docs" / "thesis.md"
+DETAILS = ROOT / "research" / "reproduction" / "figures.md"
 BEGIN, END = "<!-- report: begin -->", "<!-- report: end -->"
 STREAK = 10  # consecutive successes that count as convergence
 LONGEST = 1400  # planned episodes of a run of figures 3.5 and 3.6
@@ -58,23 +59,31 @@ class Entry:
     title: str = ""
 
 
-def write_report(tables: Path = TABLES, page: Path = PAGE) -> Path:
-    """Write the report between its markers in the page, and return the page."""
+def write_report(tables: Path = TABLES, page: Path = PAGE, details: Path = DETAILS) -> tuple[Path, Path]:
+    """Write the verdicts between their markers in the page and a file with the details, and return both paths."""
     before, _, rest = page.read_text("utf-8").partition(BEGIN)
     after = rest.partition(END)[2]
-    write_atomically(page, f"{before}{BEGIN}\n\n{format_report(entries(tables))}\n{END}{after}".encode())
-    return page
+    all_entries = entries(tables)
+    write_atomically(page, f"{before}{BEGIN}\n\n{format_verdicts(all_entries)}\n{END}{after}".encode())
+    write_atomically(details, format_details(all_entries).encode())
+    return page, details
 
 
-def format_report(all_entries: list[Entry]) -> str:
-    """Return the report as Markdown: a table of the verdicts, and a section for each entry."""
+def format_verdicts(all_entries: list[Entry]) -> str:
+    """Return the table of the verdicts as Markdown."""
     lines = ["| figure or table | verdict | runs here (thesis) |", "|---|---|---|"]
-    lines += [f"| [{_name(entry)}](#{_anchor(entry)}) | {entry.verdict} | {entry.runs} |" for entry in all_entries]
+    lines += [f"| {_name(entry)} | {entry.verdict} | {entry.runs} |" for entry in all_entries]
     hours = sum(entry.hours or 0.0 for entry in all_entries)
-    lines += ["", f"The stored training runs of this table took {hours:.1f} core-hours.", ""]
+    return "\n".join([*lines, "", f"The stored training runs of this table took {hours:.1f} core-hours.", ""])
+
+
+def format_details(all_entries: list[Entry]) -> str:
+    """Return a section for each entry as Markdown."""
+    lines = ["# Figures and tables of the thesis", "", "Written by `python -m research.thesis`.", ""]
     for entry in all_entries:
-        lines += [f"### {_name(entry)}", ""]
+        lines += [f"## {_name(entry)}", ""]
         lines += [f"- **Thesis**, {number}: {THESIS[number]}." for number in entry.numbers]
+        lines += [f"- **Verdict:** {entry.verdict}."]
         lines += [f"- **Here:** {'; '.join(entry.ours)}.", f"- **Measure:** {entry.measure}."]
         lines += [f"- **Differences:** {entry.differences}."] if entry.differences != "none" else []
         cost = "" if entry.hours is None else f" ({entry.hours:.2f} core-hours)"
@@ -94,12 +103,6 @@ def _name(entry: Entry) -> str:
 
 def _enumerate(names: list[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-
-
-def _anchor(entry: Entry) -> str:
-    """Return the anchor that MyST generates for the heading of an entry."""
-    text = _name(entry).lower().replace(" ", "-")
-    return "".join(character for character in text if character.isalnum() or character == "-")
 
 
 def entries(tables: Path = TABLES) -> list[Entry]:

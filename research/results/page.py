@@ -16,6 +16,7 @@ from guiderail.tools.tables import cell, read_table, table_text
 from guiderail_studies.declaration import LEARNED, Study, load_study
 from guiderail_studies.job import Job
 from guiderail_studies.study import BREAKING_SUCCESS, curve, draw_sweeps, format_breaking_point
+from research.engines import condition_table
 from research.figures import FIGURES
 from research.results.methods import (
     COLUMNS,
@@ -39,6 +40,7 @@ PAGES = {
     "Pouring": "pouring",
     "NarrowPassage": "narrow_passage",
 }
+ENGINES = "engines"  # table of `research.engines`, at the top of the connector's page
 # Tables of programs that are not studies, with the columns that the page shows.
 PROGRAMS = {
     "certificates": (
@@ -61,7 +63,7 @@ def store(folders: Sequence[Path], tables: Path) -> None:
     Raises:
         InputError: If a folder holds no table and no figure.
     """
-    names = [*study_names(), *PROGRAMS]
+    names = [*study_names(), *PROGRAMS, ENGINES]
     for folder in folders:
         finished = [folder / f"{name}.csv" for name in names if (folder / f"{name}.csv").is_file()]
         figures = [folder / f"{name}.json" for name in FIGURES.values() if (folder / f"{name}.json").is_file()]
@@ -100,6 +102,8 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
         if not own:
             continue
         sections = [_page_head(f"Results: {task}")]
+        if task == "BncConnector" and (tables / f"{ENGINES}.csv").is_file():
+            sections.append(_ENGINES.format(table=condition_table(read_table(tables / f"{ENGINES}.csv"))))
         if methods := task_table(task, tables):
             sections.append(f"## All methods\n\n{methods}")
         for name, study in own.items():
@@ -135,6 +139,21 @@ _STUDIES = """\
 `guiderail study research/studies/NAME.yaml --out studies --trust-imports` runs a study. `research/results/NAME.csv` has
 its results with a row for each seed, and [differences.csv](differences.csv) the differences of its methods from the
 thesis. A method that the tables above omit is in the section of its study below.
+"""
+
+
+_ENGINES = """\
+## One skill in several engines
+
+Connector, hard, with a force-torque sensor at the wrist, in the present contact, which has converged at its plant step
+of 5 ms. Successes of held-out episodes, one number per seed. `python -m research.engines --out engines` trains and
+evaluates; `research/results/engines.csv` has forces, violations and the training of each seed.
+
+{table}
+
+**All other tables on this page are an appendix: they were measured in the contact of that time at a plant step of
+10 ms**, which had not converged ([why](../experiments.md#converged-contact-of-the-connector)). They compare methods in
+that contact.
 """
 
 

@@ -56,7 +56,7 @@ _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
 SECTIONS: dict[str, list[Section]] = {
     "BncConnector": [
         Section(
-            "Connector, hard, on an iiwa with a robot's sensors",
+            "Connector, hard, on an iiwa with a robot's sensors, contact at 10 ms",
             [
                 Row("KGRL", "connector_robot_sensing", "kgrl"),
                 Row("KGRL, 80 episodes, then 60 with finer contact", "connector_robot_sensing_fine", "kgrl", "fresh"),
@@ -75,7 +75,7 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("KGRL",),
         ),
         Section(
-            "Connector, hard",
+            "Connector, hard, contact at 10 ms",
             [
                 Row("KGRL", "peers_connector_hard", "kgrl"),
                 Row("sKGRL, adaptive history", "peers_connector_hard", "skgrl_adaptive"),

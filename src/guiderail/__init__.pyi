@@ -21,6 +21,7 @@ from .diagrams.guidance.prior import ScriptedApproach as ScriptedApproach
 from .diagrams.guidance.registry import register_guidance as register_guidance
 from .diagrams.stations.plane import PlaneStation as PlaneStation
 from .diagrams.stations.registry import register_station as register_station
+from .diagrams.stations.station import JointStation as JointStation
 from .diagrams.stations.station import Station as Station
 from .diagrams.tasks.insertion import InsertionTask as InsertionTask
 from .diagrams.tasks.registry import register_task as register_task
@@ -36,6 +37,7 @@ from .models.laws import Law as Law
 from .models.laws import PrimitiveLaw as PrimitiveLaw
 from .models.laws import Stepper as Stepper
 from .models.laws import TemplateLaw as TemplateLaw
+from .models.objects.narrow_passage import PassageGeometry as PassageGeometry
 from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp
@@ -50,9 +52,9 @@ from .models.robots.robot import Robot as Robot
 from .models.robots.robot import register_robot as register_robot
 from .models.templates import SharedControlTemplate as SharedControlTemplate
 from .models.templates import load_template as load_template
-from .systems.episode_monitor import TerminationTerm as TerminationTerm
+from .systems.episode_terms import RewardTerm as RewardTerm
+from .systems.episode_terms import TerminationTerm as TerminationTerm
 from .systems.policy_system import PolicySystem as PolicySystem
-from .systems.reward_system import RewardTerm as RewardTerm
 from .tools.evaluation.episode import Callback as Callback
 from .tools.evaluation.episode import Transition as Transition
 from .tools.evaluation.evaluate import evaluate as evaluate

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -35,11 +36,12 @@ def test_notebook_runs_in_a_new_interpreter(notebook, tmp_path):
     assert finished.returncode == 0, finished.stderr
 
 
-def test_colab_notebook_installs_the_package_first():
+def test_colab_notebook_installs_the_wheel_of_this_version_first():
     (notebook,) = (path for path in NOTEBOOKS if path.stem == "0_colab")
-    first = code_cells(notebook)[0]["source"]
-    assert first == [line for line in first if line.startswith("%pip install")]
-    assert "guiderail" in first[0]
+    name, install = code_cells(notebook)[0]["source"]
+    version = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    assert name.startswith(f'WHEEL = "guiderail-{version}-py3-none-any.whl"')
+    assert install.startswith("%pip install --quiet {WHEEL} ")
 
 
 def test_notebooks_are_complete_and_have_no_outputs():

@@ -77,7 +77,7 @@ def test_reference_has_every_command_task_and_template_kind(reference):
     import typer
 
     from guiderail.diagrams.tasks.registry import TASKS
-    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
     from guiderail.tools.cli.main import load_commands
     from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
@@ -102,6 +102,14 @@ def test_signatures_of_the_reference_have_types(reference):
     signatures = re.findall(r"^    (\**\w+)(: [^=]+)?(?: ?=.*)?,$", reference["names"], re.MULTILINE)
     assert len(signatures) > 100
     assert not [name for name, hint in signatures if not hint]
+
+
+def test_reference_links_to_pages_that_exist(generator, reference):
+    for name, page in reference.items():
+        for link in LINK.findall(page):
+            target = (DOCS / "reference" / link).resolve()
+            is_page = link.removesuffix(".md") in generator.PAGES or target.is_file()
+            assert "://" in link or is_page, f"the reference page {name} links to {link}, which does not exist"
 
 
 def test_template_fields_have_descriptions(reference):
@@ -131,7 +139,7 @@ def test_reference_has_no_local_path(reference):
 def test_robot_page_has_the_limits_of_the_code():
     import numpy as np
 
-    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
     from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
     from guiderail_hardware.drivers.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE

@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware.drivers.driver import Driver
 from guiderail_hardware.models.joint_status import JointStatus
 from guiderail_hardware.station import HardwareStation

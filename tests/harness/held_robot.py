@@ -11,7 +11,7 @@ from collections import Counter
 import numpy as np
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.bnc_connector.task import scripted_center_of_pressure
+from guiderail.diagrams.tasks.bnc_connector import scripted_center_of_pressure
 from guiderail.models.common.arrays import round_period
 
 PROGRESS = {

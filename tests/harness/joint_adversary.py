@@ -14,10 +14,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.command_filter import CommandFilter
+from guiderail.systems.command_checks import CommandFilter
 
 START = np.array([0.0, 0.0, 0.1, 0.7, 0.0, 0.0])
 REACH = np.array([0.5, 0.5, 0.4, 2.5, 0.8, 0.8])  # largest offsets of the desired poses from the start [m, rad]
@@ -49,7 +49,7 @@ def attack(steps: int, seed: int = 0, *, constrained: bool = True) -> Result:
     """Run `steps` control steps with or without the joint constraints; return the result."""
     rng, result, builder = np.random.default_rng(seed), Result(), DiagramBuilder()
     station = builder.AddNamedSystem("station", ArmStation(BncWorkcell()))
-    joints = station.joint_range(MARGIN, 0.05)
+    joints = station.joint_range(MARGIN)
     linear = LinearConstraints(np.eye(6)[2:3], np.array([MIN_HEIGHT]))
     motion = MotionConstraints(linear, max_speed=SPEED, state=[joints] if constrained else [])
     system = CommandFilter(MotionConstraintFilter(motion, station.control_period), station.control_period)

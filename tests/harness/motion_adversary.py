@@ -119,7 +119,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
     else:
         speed, acceleration = LIMITS.get(kind, (np.inf, np.inf))
         limits = np.full(2, speed), np.full(2, acceleration)
-        motion = MotionConstraintFilter(MotionConstraints(constraints, [sphere], (), *limits), config.control_period)
+        motion = MotionConstraintFilter(MotionConstraints(constraints, [sphere], *limits), config.control_period)
     primitive = LcNsKmp(reference, horizon=10, history=history, constraints=constraints)
     gain = config.null_space_gains(primitive) * rng.choice([1.0, 3.0, 30.0])
     for _ in range(EPISODES):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR
-from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE, scripted_pour_aimed, scripted_pour_blind
+from guiderail.diagrams.tasks.pouring import MAX_MUG_ERROR, POSITION_SCALE, scripted_pour_aimed, scripted_pour_blind
 from guiderail_studies.declaration import LEARNED, load_study
 from guiderail_studies.job import Job
 from research.studies import study_path

@@ -76,7 +76,7 @@ OTHER_VALUES = {
     "force_limit_range": (12.0, 12.0), "sensing.wrench_scale": (0.5, 2.0),
     "sensing.wrench_bias": (1.0, 0.1), "sensing.wrench_drift": (1.0, 0.1), "sensing.wrench_noise": (1.0, 0.1),
     "sensing.wrench_delay": 3, "sensing.calibration_error": (0.001, 0.01), "sensing.tare": True,
-    "max_speed": (0.1,), "max_acceleration": (1.0,), "joint_margin": 0.1, "min_singular_value": 0.05,
+    "max_speed": (0.1,), "max_acceleration": (1.0,), "joint_margin": 0.1,
     "progress": "state", "progress.tolerance": (0.005, 0.2), "base_policy": "other", "base_policy.guard": "none",
     "base_policy.max_jerk": (100.0,), "num_demonstrations": 1, "prior_std": (0.001, 0.001, 0.001, 0.01, 0.01, 0.01),
     "pour_distance": 0.09,

@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates import parse_template
-from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
+from guiderail.systems.shared_control_template import ActiveConstraintProjector
 
 PERIOD = 2.0**-7
 ABOVE = """

@@ -8,9 +8,9 @@ from pydrake.multibody.tree import RevoluteJoint
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.catalog import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems import cartesian_position_controller
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
@@ -29,7 +29,7 @@ def arm():
 class Rig:
     """Controller whose joint command starts at the pose `START` or at given joint positions."""
 
-    def __init__(self, arm, q_start=None, **options):
+    def __init__(self, arm, q_start=None, posture=READY_POSTURE, **options):
         self.plant, model = arm
         if q_start is None:
             q_start = solve_inverse_kinematics(
@@ -37,7 +37,7 @@ class Rig:
             )
         self.q_start = q_start
         self.system = CartesianPositionController(
-            self.plant, model.target, model.tool_center, **{"posture": READY_POSTURE} | options
+            self.plant, model.target, model.tool_center, posture=posture, **options
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
@@ -154,8 +154,8 @@ def outside_limit(arm, posture, joint, excess):
 BENT, STRETCHED = READY_POSTURE, np.zeros(7)
 
 
-@pytest.mark.parametrize("excess", [1e-4, 0.02, 0.3])
-@pytest.mark.parametrize(("posture", "joint"), [(BENT, 1), (BENT, 3), (BENT, 5), (STRETCHED, 1)])
+@pytest.mark.parametrize("excess", [1e-4, 0.3])
+@pytest.mark.parametrize(("posture", "joint"), [(BENT, 3), (STRETCHED, 1)])
 def test_joint_outside_its_limit_returns_without_a_jump(arm, posture, joint, excess):
     """A person may have moved the joint there by hand. The stretched posture is also singular."""
     q, goal = outside_limit(arm, posture, joint, excess)
@@ -194,7 +194,7 @@ def test_joint_command_is_constant_when_the_pose_is_not_finite(arm):
 
 
 def test_joint_command_is_constant_when_commands_stop(arm):
-    rig = Rig(arm, timeout=0.1)
+    rig = Rig(arm)
     rig.command(GOAL, time=0.0)
     rig.advance(0.095)
     assert rig.command_timed_out == 0.0
@@ -222,25 +222,11 @@ def test_command_is_ignored_when_its_time_stamp_is_invalid(arm, time):
     assert rig.command_timed_out == 1.0
 
 
-def test_time_stamps_change_nothing_when_commands_are_current(arm):
-    without_time, with_time = Rig(arm), Rig(arm)
-    without_time.command(GOAL)
-    for step in range(20):
-        with_time.command(GOAL, time=0.01 * step)
-        for rig in (without_time, with_time):
-            rig.simulator.AdvanceTo(0.01 * (step + 1))
-    np.testing.assert_array_equal(with_time.joints, without_time.joints)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
         {"posture": np.full(7, np.nan)},
         {"posture": np.array([0.0] * 6 + [np.inf])},
-        {"posture_gain": -1.0},
-        {"posture_gain": np.nan},
-        {"posture_gain": np.inf},
-        {"timeout": 0.0},
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(arm, arguments):
@@ -263,19 +249,6 @@ def test_constructor_refuses_an_arm_of_fewer_than_six_joints():
 def test_speed_limits_refuse_values_out_of_range(name, speed):
     with pytest.raises(InputError, match="positive"):
         SpeedLimits(**{name: speed})
-
-
-def test_controller_has_its_documented_defaults(arm):
-    explicit = {"speed_limits": SpeedLimits(translational=0.25, rotational=1.0), "posture_gain": 0.5, "timeout": 0.1}
-    for time in (None, 0.0, -5e-5):
-        joints = []
-        for options in ({}, explicit):
-            rig = Rig(arm, **options)
-            rig.command(START + [0.3, 0.0, 0.0, 2.0, 0.0, 0.0], time)
-            rig.advance(0.145)
-            joints.append(rig.joints)
-        np.testing.assert_array_equal(*joints)
-    assert SpeedLimits() == explicit["speed_limits"]
 
 
 def test_flags_are_reset_at_initialization(arm):
@@ -379,37 +352,25 @@ def test_velocities_have_a_common_scale_in_a_singular_posture(arm, monkeypatch, 
 SINGULAR = np.array([-0.2448, -1.3796, 1.8297, -2.021, 0.0, 0.0])
 
 
-class SixJointRig(Rig):
-    """Controller of a UR5e that starts in a singular posture and is commanded to move by `shift` (6,).
+def singular_rig(shift, lower_share=1.0):
+    """Return a rig of a UR5e that starts in a singular posture and is commanded to move by `shift` (6,), and its start.
 
-    Args:
-        shift: Desired pose minus initial pose.
-        lower_share: Factor of the lower velocity limits.
+    `lower_share` is a factor of the lower velocity limits.
     """
-
-    def __init__(self, shift, lower_share=1.0):
-        model = ArmControllerPlant(BncWorkcell(), "ur5e")
-        for index in model.plant.GetJointIndices():
-            joint = model.plant.get_joint(index)
-            joint.set_velocity_limits(lower_share * joint.velocity_lower_limits(), joint.velocity_upper_limits())
-        self.plant, self.q_start = model.plant, SINGULAR
-        self.system = CartesianPositionController(
-            model.plant, model.arm.target, model.arm.tool_center, posture=model.posture
-        )
-        self.simulator = Simulator(self.system)
-        self.context = self.simulator.get_mutable_context()
-        self.system.get_positions_input_port().FixValue(self.context, SINGULAR)
-        context = model.plant.CreateDefaultContext()
-        model.plant.SetPositions(context, SINGULAR)
-        self.start = transform_to_pose(model.arm.tool_center.CalcPose(context, model.arm.target))
-        self.desired = self.system.get_desired_pose_input_port().FixValue(self.context, self.start + shift)
-        self.simulator.Initialize()
+    model = ArmControllerPlant(BncWorkcell(), "ur5e")
+    for index in model.plant.GetJointIndices():
+        joint = model.plant.get_joint(index)
+        joint.set_velocity_limits(lower_share * joint.velocity_lower_limits(), joint.velocity_upper_limits())
+    rig = Rig((model.plant, model.arm), SINGULAR, model.posture)
+    start = rig.pose
+    rig.command(start + shift)
+    return rig, start
 
 
 @pytest.mark.parametrize("shift", [[0.05, 0, 0, 0, 0, 0], [0, 0.05, 0, 0, 0, 0], [0, 0, 0, 0.3, 0, 0], [0] * 6])
 def test_tool_leaves_a_singular_posture_without_a_jump(shift):
     """The orientation deviates temporarily about the direction that the wrist lost, while `stuck` is 1."""
-    rig = SixJointRig(np.array(shift))
+    rig, start = singular_rig(np.array(shift))
     limit = rig.plant.GetVelocityUpperLimits()
     errors, stuck = [], []
     rig.advance(0.005)
@@ -417,7 +378,7 @@ def test_tool_leaves_a_singular_posture_without_a_jump(shift):
         q = rig.joints
         rig.advance(0.01)
         assert (np.abs(rig.joints - q) / 0.01 <= limit + 1e-6).all()
-        errors.append(np.abs(rig.pose - rig.start - shift))
+        errors.append(np.abs(rig.pose - start - shift))
         stuck.append(rig.stuck)
     errors = np.array(errors)
     assert errors[:, :3].max() < np.abs(shift[:3]).max() + 0.005
@@ -427,7 +388,7 @@ def test_tool_leaves_a_singular_posture_without_a_jump(shift):
 
 
 def test_lower_velocity_limits_apply_in_a_singular_posture():
-    rig = SixJointRig(np.array([0.05, 0.0, 0.0, 0.3, 0.0, 0.0]), lower_share=0.05)
+    rig, _ = singular_rig(np.array([0.05, 0.0, 0.0, 0.3, 0.0, 0.0]), lower_share=0.05)
     lower, min_velocity = rig.plant.GetVelocityLowerLimits(), np.zeros(6)
     rig.advance(0.005)
     for _ in range(60):
@@ -440,9 +401,9 @@ def test_lower_velocity_limits_apply_in_a_singular_posture():
 
 def test_tool_follows_its_path_near_a_singular_posture():
     """The path leaves the singularity by a rotation about a direction that the wrist has not lost."""
-    rig = SixJointRig(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
+    rig, start = singular_rig(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
     rig.advance(3.0)
-    np.testing.assert_allclose(rig.pose, rig.start + [0, 0, 0, 0, 0.5, 0], atol=1e-4)
+    np.testing.assert_allclose(rig.pose, start + [0, 0, 0, 0, 0.5, 0], atol=1e-4)
     assert rig.stuck == 0.0
 
 

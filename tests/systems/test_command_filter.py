@@ -3,11 +3,10 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.command_filters import BarrierFilter, KeepOutFilter, TangentSpaceFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import BarrierFilter, KeepOut, KeepOutFilter, TangentSpaceFilter
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.command_filter import CommandFilter
+from guiderail.systems.command_checks import CommandFilter
 
 PERIOD = 0.125
 BOX = LinearConstraints.box([-1.0, -np.inf], [1.0, np.inf])
@@ -198,12 +197,6 @@ def start(system, desired, pose):
 def test_measured_pose_has_no_direct_feedthrough(projection):
     feedthrough = [[projection.HasDirectFeedthrough(i, o) for o in range(2)] for i in range(2)]
     assert feedthrough == [[True, True], [False, False]]
-
-
-def test_safe_command_is_passed_through(projection):
-    _, context, _, _ = start(projection, [0.5, 0.3], [0.0, 0.0])
-    np.testing.assert_array_equal(projection.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
-    assert projection.get_intervention_output_port().Eval(context) == [0.0]
 
 
 def test_command_into_the_wall_is_projected_onto_its_margin(projection):

@@ -2,7 +2,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.command_checks import ConstraintViolation
 
 
 def violation(system, pose):

@@ -10,7 +10,7 @@ from guiderail.models.common.transforms import (
     rpy_angles,
     transform_to_pose,
 )
-from guiderail.systems.body_poses import ContinuousPose
+from guiderail.systems.poses import ContinuousPose
 
 PERIOD = 0.02
 STEPS = 60

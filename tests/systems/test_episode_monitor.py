@@ -4,7 +4,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
-from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
+from guiderail.systems.episode_terms import EpisodeMonitor, TerminationTerm
 
 PERIOD = 0.1
 SUCCESS, BLOCKED = Termination.SUCCESS.index, Termination.BLOCKED.index

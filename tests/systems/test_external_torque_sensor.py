@@ -5,9 +5,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.catalog import IIWA14
 from guiderail.systems import ExternalTorqueSensor, JointTorqueErrors
 
 HOME = np.array(IIWA14.home)

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.history import HistoryLengthSchedule
+from guiderail.systems.movement_primitive import HistoryLengthSchedule
 
 PERIOD = 0.125
 

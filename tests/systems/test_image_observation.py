@@ -1,7 +1,7 @@
 import numpy as np
 from pydrake.systems.sensors import ImageRgba8U
 
-from guiderail.systems.image_observation import ImageObservation
+from guiderail.systems.policy_system import ImageObservation
 
 
 def test_observation_is_the_channels_of_the_image_and_the_state():

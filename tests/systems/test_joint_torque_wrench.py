@@ -4,10 +4,10 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.robots.iiwa import IIWA14
-from guiderail.systems.joint_torque_wrench import JointTorqueWrench
+from guiderail.models.robots.catalog import IIWA14
+from guiderail.systems.wrench_sensors import JointTorqueWrench
 
 READY_POSTURE = np.array(IIWA14.home)
 

@@ -3,7 +3,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.systems.body_poses import MeasuredPose
+from guiderail.systems.poses import MeasuredPose
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
 X_WT = RigidTransform(RotationMatrix.MakeYRotation(0.2), [0.1, 0.2, 0.3])

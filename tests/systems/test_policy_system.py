@@ -71,28 +71,6 @@ def test_action_is_set_before_discrete_updates_of_its_instant():
     assert Loop(scaled_policy).run(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
 
 
-def test_discrete_update_would_delay_the_action_by_one_period():
-    """Counterexample that shows why the system uses an unrestricted update."""
-
-    class DiscretePolicy(LeafSystem):
-        def __init__(self):
-            super().__init__()
-            self.observation = self.DeclareVectorInputPort("observation", 1)
-            self.DeclareStateOutputPort("action", self.DeclareDiscreteState(1))
-            self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.decide)
-
-        def decide(self, context, discrete_state):
-            discrete_state.set_value(scaled_policy(self.observation.Eval(context)))
-
-    builder = DiagramBuilder()
-    counter, policy, hold = (builder.AddSystem(s) for s in (Counter(), DiscretePolicy(), ZeroOrderHold(PERIOD, 1)))
-    builder.Connect(counter.get_output_port(), policy.get_input_port())
-    builder.Connect(policy.get_output_port(), hold.get_input_port())
-    simulator = Simulator(builder.Build())
-    simulator.AdvanceTo(3.5 * PERIOD)
-    assert hold.get_output_port().Eval(hold.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
-
-
 def test_action_is_constant_until_the_next_action_period():
     calls = []
     loop = Loop(lambda observation: calls.append(observation) or scaled_policy(observation), action_repeat=4)
@@ -143,14 +121,6 @@ def test_policy_error_is_raised_when_the_action_is_invalid(action):
     with pytest.raises(PolicyError, match="the robot must stop"):
         loop.run(1)
     assert loop.read(loop.system) == 0.0
-
-
-def test_exception_of_the_policy_is_propagated():
-    def broken(observation):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        Loop(broken).run(1)
 
 
 @pytest.mark.parametrize("action_repeat", [1, 5])

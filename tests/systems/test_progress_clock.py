@@ -10,7 +10,7 @@ from guiderail.models.common.transforms import (
     transform_to_pose,
 )
 from guiderail.models.laws.primitive import StateProgress
-from guiderail.systems.progress_clock import ProgressClock
+from guiderail.systems.movement_primitive import ProgressClock
 
 PERIOD = 0.125
 RULE = StateProgress((0.01, 0.1), 4)

@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.systems.body_poses import RelativePoses
+from guiderail.systems.poses import RelativePoses
 
 X_WA = RigidTransform(RotationMatrix.MakeZRotation(0.5), [1.0, 0.0, 0.2])
 X_WB = RigidTransform(RotationMatrix.MakeXRotation(-2.1), [0.0, 0.3, 0.0])

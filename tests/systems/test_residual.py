@@ -1,6 +1,6 @@
 import numpy as np
 
-from guiderail.systems.residual import Residual
+from guiderail.systems.movement_primitive import Residual
 
 
 def test_desired_pose_is_reference_plus_scaled_action():

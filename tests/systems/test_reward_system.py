@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.reward_system import RewardSystem, RewardTerm
+from guiderail.systems.episode_terms import RewardSystem, RewardTerm
 
 
 @pytest.fixture

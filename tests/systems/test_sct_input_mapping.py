@@ -6,7 +6,7 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates import load_template
-from guiderail.systems.sct_input_mapping import SctInputMapping
+from guiderail.systems.shared_control_template import SctInputMapping
 
 PERIOD = 0.01
 FRAMES = {"mug_tip": RigidTransform([0.1, 0.0, 0.0])}

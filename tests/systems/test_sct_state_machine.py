@@ -10,8 +10,8 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
 from guiderail.models.templates import load_template
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
-from guiderail.systems.sct_state_machine import SctStateMachine
+from guiderail.systems.shared_control_template import SctStateMachine
+from guiderail.systems.wrench_limits import PhaseWrenchLimit
 
 PERIOD = 2.0**-7
 FRAMES = {"mug_tip": RigidTransform([0.0, 0.1, 0.0])}

@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import WrenchSensor
 
 PERIOD = 0.001
 R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))

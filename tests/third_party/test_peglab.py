@@ -198,7 +198,7 @@ def test_policy_of_a_run_is_simulated_in_a_diagram(lab, run_folder):
 def test_task_in_a_file_works_without_installation(lab):
     (lab.folder / "local_task.py").write_text(
         "from guiderail import register_task\n"
-        "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
+        "from guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n\n"
         "@register_task('local/Passage')\nclass LocalPassage(NarrowPassage):\n    duration = 0.8\n"
     )
     guiderail(

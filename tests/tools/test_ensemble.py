@@ -48,13 +48,6 @@ def test_damaged_ensembles_are_refused(tmp_path):
             Policy.load(tmp_path)
 
 
-def test_different_policies_are_no_ensemble():
-    with pytest.raises(ValueError, match="the same observation_shape"):
-        Ensemble([policy(0), policy(1, size=4)])
-    with pytest.raises(ValueError, match="the same action_low"):
-        Ensemble([policy(0), policy(1, action_low=[-2.0, -1.0])])
-
-
 def test_ensemble_of_runs_is_evaluated_like_a_run(bead_run, tmp_path, capsys):
     other, out = tmp_path / "other", tmp_path / "mean"
     shutil.copytree(bead_run, other)

@@ -1,7 +1,6 @@
 """Task that a user declares: effects of the declaration, and messages about mistakes in it."""
 
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -17,9 +16,9 @@ from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.tools.catalog import describe_task_options, describe_template
+from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
@@ -66,22 +65,9 @@ def declare(of=Own, **attributes):
     return register_task("lab/Own")(type("Declared", (of,), {**attributes, "__module__": __name__}))
 
 
-@pytest.mark.parametrize(
-    ("attributes", "message"),
-    [
-        ({"Reset": None}, "Reset of lab/Own must be a subclass of ResetOptions"),
-        ({"clip": None}, "clip of lab/Own must be a positive number"),
-        (
-            {"scripted_policies": lambda self, difficulty: {}},
-            r"^scripted_policies of lab/Own is called without an instance: make it a @classmethod with the arguments "
-            r"\(cls, difficulty\)$",
-        ),
-        ({"station": dict}, "station of lab/Own is a class that register_station registers"),
-    ],
-)
-def test_declaration_of_the_wrong_type_is_refused(attributes, message):
-    with pytest.raises(InputError, match=message):
-        declare(**attributes)
+def test_scripted_policies_of_an_instance_are_refused():
+    with pytest.raises(InputError, match="scripted_policies of lab/Own is called without an instance"):
+        declare(scripted_policies=lambda self, difficulty: {})
 
 
 @pytest.mark.parametrize(
@@ -99,7 +85,7 @@ def test_task_without_a_possible_environment_is_refused(attributes, message):
 
 
 def test_task_that_lacks_methods_is_refused_with_their_names():
-    message = r"lab/Own lacks done\(\), rewards\(\), workcell\(\): every task must define these methods"
+    message = "the class Declared lacks done, rewards, workcell: see `Task`"
     with pytest.raises(InputError, match=message):
         declare(of=Task, station=PlaneStation)
 
@@ -139,19 +125,9 @@ def returning(value):
         ({"rewards": returning({"a": lambda place: 0.0})}, "reward 'sparse' of lab/Own needs the signal 'place'"),
         ({"rewards": returning({"a": 3.0})}, "reward 'sparse' of lab/Own is a function of signals, .*, not 3.0"),
         ({"rewards": returning({"a": max})}, "reward 'sparse' of lab/Own "),
-        ({"rewards": returning([max])}, r"rewards\(\) of lab/Own must return functions of signals by name, not \["),
         ({"rewards": returning(HUGE)}, "the sum of the reward terms of lab/Own is not finite, but inf"),
         ({"done": returning({"success": lambda place: False})}, "termination of lab/Own needs the signal 'place'"),
         ({"done": returning({"won": lambda pose: False})}, "an episode can't end as 'won', only as success"),
-        ({"done": returning(None)}, r"done\(\) of lab/Own must return functions of signals by name, not None"),
-        ({"observe": returning(ObservationTerm("pose"))}, "must return Observed or a list of ObservationTerm, not Obs"),
-        ({"observe": returning(("pose",))}, r"must return Observed or a list of ObservationTerm, not \('pose',\)"),
-        ({"reset": returning(3)}, "reset of lab/Own must return the sampled values by name, or nothing, not 3"),
-        (
-            {"workcell": returning(5)},
-            r"workcell\(\) of lab/Own returns 5, which has no robot_radius: .* station='plane'",
-        ),
-        ({"workcell": returning(None)}, r"workcell\(\) of lab/Own returns nothing: let it return what station='plane'"),
         (
             {"collision": property(returning(Threshold("wrench")))},
             "threshold of lab/Own takes one number as the signal 'wrench', which has 2",
@@ -170,37 +146,16 @@ def test_wrong_declaration_is_named_at_the_first_step(attributes, message):
     assert "\n" not in str(error.value)
 
 
-def test_reward_that_overflows_in_a_step_is_refused():
-    declare(rewards=returning({"a": HUGE["a"]}))
-    with pytest.raises(InputError, match="the reward of 5 control steps overflows: scale it down"):
-        first_step(action_repeat=5)
-
-
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
         ((), "the observation of lab/Own is empty: let observe"),
         ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
-        (
-            (ObservationTerm("pose", scale=0.0),),
-            "the observed signal 'pose' of lab/Own is divided by its scale, which cannot be .*0.0",
-        ),
-        ((ObservationTerm("phase"), ObservationTerm("pose", scale=[0.5, 0.0])), "'pose' .* its scale, which cannot be"),
-        ((ObservationTerm("pose", scale=1e-320),), "the observed signal 'pose' of lab/Own is divided by its scale"),
-        (
-            (ObservationTerm("pose", scale=np.nan),),
-            "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan",
-        ),
-        ((ObservationTerm("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
-        ((ObservationTerm("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
-        ((ObservationTerm("pose", center=np.inf),), "the center .* is a finite number, or 2 of them, not inf"),
-        (
-            (ObservationTerm("pose", entries=(0, 5)),),
-            "the entries .* 'pose' of lab/Own are whole numbers from -2 to 1, not",
-        ),
-        ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from -2 to 1, not 1"),
-        ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from -2 to 1, not"),
-        ((ObservationTerm("pose", entries=(True, False)),), "the entries .* are whole numbers from -2 to 1, not"),
+        ((ObservationTerm("pose", scale=0.0),), "the observed signal 'pose' of lab/Own has a .* scale that is not 0"),
+        ((ObservationTerm("phase"), ObservationTerm("pose", scale=[0.5, 0.0])), "'pose' .* scale that is not 0"),
+        ((ObservationTerm("pose", scale=1e-320),), "the observed signal 'pose' of lab/Own has a center and a scale"),
+        ((ObservationTerm("pose", scale=np.nan),), "are finite"),
+        ((ObservationTerm("pose", center=np.inf),), "are finite"),
     ],
 )
 def test_invalid_observation_term_is_refused(terms, message):
@@ -306,13 +261,6 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
         import_modules(["nowhere_to_be_found"])
     assert sys.path == path
     sys.modules.pop("lab_period")
-
-
-def test_validate_template_accepts_the_name_of_a_template(monkeypatch):
-    monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    first, second = describe_template(Path("pouring"))["transitions"]
-    assert first == "translational → tilt below 0.25 m, back above 0.27 m"
-    assert second == "tilt → pour below 0.075 m, no way back"
 
 
 def test_task_keeps_its_name_when_another_name_is_taken():

@@ -160,22 +160,3 @@ def test_tensor_without_values_is_refused_in_one_sentence():
     policy = as_policy(lambda observation: torch.zeros(2, device="meta"))
     with pytest.raises(InputError, match="cannot be converted to an array: return a NumPy array"):
         policy(np.zeros(1))
-
-
-@pytest.mark.parametrize(
-    "act",
-    [
-        lambda observation: torch.tanh(torch.nn.Linear(1, 2)(torch.as_tensor(observation))),
-        lambda observation: torch.zeros(1, 2, requires_grad=True),
-        lambda observation: [torch.tensor(0.0, requires_grad=True)] * 2,
-    ],
-)
-def test_policy_of_tensors_acts_in_a_task(act):
-    assert evaluate(act, "NarrowPassage", 1, baselines=(), environment={"guidance": "kgrl"})["episodes"] == 1
-
-
-@pytest.mark.parametrize("device", ["cuda"])
-def test_tensor_on_a_device_becomes_an_array(device):
-    if not torch.cuda.is_available():
-        pytest.skip("no device")
-    np.testing.assert_array_equal(from_tensors(torch.ones(2, device=device, requires_grad=True)), [1.0, 1.0])

@@ -17,7 +17,7 @@ import typer
 import typer.core
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import find_plugins
+from guiderail.models.common.registry import find_plugins
 
 SEED = 1_000_000  # default seed of the first held-out episode
 COLUMN = 19  # width of a value in a table with several columns [characters]
@@ -107,16 +107,6 @@ def _names(place: str) -> Callable[[], list[str]]:
     return list_names
 
 
-def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
-    """Return a function that lists what the options of all tasks of guiderail declare under `attribute`."""
-
-    def list_names() -> list[str]:
-        models = [point.load() for _, point in find_plugins("task_options")]
-        return sorted({name for model in models for name in getattr(model, attribute)})
-
-    return list_names
-
-
 REGISTRIES = {
     "tasks": "guiderail.diagrams.tasks.registry:TASKS",
     "guidance": "guiderail.diagrams.guidance.registry:GUIDANCE",
@@ -144,8 +134,6 @@ def find_broken(key: str) -> dict[str, str]:
 
 
 CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
-    "rewards": _declared_by_tasks("rewards"),
-    "observations": _declared_by_tasks("observations"),
     "templates": _names("guiderail.models.templates.schema:shipped_templates"),
     "log_formats": _names("guiderail.tools.learning.learner:LOG_FORMATS"),
     "pictures": _names("guiderail.tools.files:PICTURES"),
@@ -385,17 +373,11 @@ class EnvironmentOptions:
     action_repeat: Annotated[int | None, option("Control steps per action.")] = None
     reward: Annotated[
         str | None,
-        option(
-            "Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task.",
-            choices="rewards",
-        ),
+        option("Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task."),
     ] = None
     observation: Annotated[
         str | None,
-        option(
-            "Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task.",
-            choices="observations",
-        ),
+        option("Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task."),
     ] = None
     fixture_offset: Annotated[
         str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")

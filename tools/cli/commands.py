@@ -12,8 +12,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, check_task_name
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import MissingSiblingError, find_plugins, load_plugin
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import MissingSiblingError, did_you_mean, find_plugins, load_plugin
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 
@@ -430,11 +429,9 @@ def list_(
     elif name == "metrics":
         from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
-        metrics = [
-            *(("episode: ", column) for column in COLUMNS),
-            *(("episodes: ", m) for m in statistics_of().values()),
-        ]
-        text = {prefix + m.name: m.description + (f" [{m.unit}]" if m.unit else "") for prefix, m in metrics}
+        metrics = [("episode: ", *column) for column in COLUMNS]
+        metrics += [("episodes: ", m.name, m.unit, m.description) for m in statistics_of().values()]
+        text = {prefix + name: meaning + (f" [{unit}]" if unit else "") for prefix, name, unit, meaning in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
         print_result({name: _usable(name)}, as_json)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
+from guiderail.diagrams.tasks.narrow_passage import avoids_obstacle_from
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy

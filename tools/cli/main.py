@@ -13,8 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from guiderail.models.common.errors import InputError, RunsFailedError, brief, explain_missing
-from guiderail.models.common.plugins import SIBLINGS, MissingSiblingError, find_plugins
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import SIBLINGS, MissingSiblingError, did_you_mean, find_plugins
 from guiderail.tools.cli.app import app, print_message
 from guiderail.tools.terminal import protect_terminal
 

@@ -59,9 +59,8 @@ class Callback:
     def on_step(self, transition: Transition) -> None:
         """Handle the transition of an action."""
 
-    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Handle the end of an episode; return further columns of its row."""
-        return {}
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
+        """Handle the end of an episode; return further columns of its row, if there are any."""
 
 
 class EnvCallback(Callback):

@@ -7,10 +7,8 @@ An episode's numbers are computed from its `EpisodeTrace`, which contains all co
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,31 +37,6 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-@dataclass(frozen=True)
-class Episode:
-    """Finished episode."""
-
-    index: int  # number of the episode, from 0
-    trace: EpisodeTrace  # every control step
-    total: float  # sum of the rewards that the environment returned
-    terms: Mapping[str, float]  # sum of each reward term
-    info: Mapping[str, Any]  # `info` of the last step
-
-    @cached_property
-    def statistics(self) -> dict[str, float]:
-        """Statistics of the trace; violations are those of the start if the simulation failed at the first step."""
-        statistics = self.trace.statistics()
-        if not len(self.trace):
-            statistics["max_commanded_violation"] = self.info["constraint_violation"]
-            statistics["max_measured_violation"] = self.info["measured_violation"]
-        return statistics
-
-    @property
-    def termination(self) -> str:
-        """Reason why the episode ended."""
-        return Termination.SIMULATION_FAILURE.value if "simulation_failure" in self.info else self.info["termination"]
-
-
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     """Return the mean jerk of poses (n, O) at intervals of `period` [s]: "linear" [m/s³] and "angular" [rad/s³].
 
@@ -74,85 +47,75 @@ def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     return {"linear": mean_jerk(poses[:, :3], period), "angular": angular}
 
 
-def _jerk(which: str, part: str) -> Callable[[Episode], float]:
-    return lambda e: jerk(getattr(e.trace, which), e.trace.period)[part]
-
-
-def _statistic(name: str) -> Callable[[Episode], float]:
-    return lambda e: float(e.statistics[name])
-
-
-def _count(name: str) -> Callable[[Episode], int]:
-    return lambda e: int(e.statistics[name])
-
-
-def _squared_force(e: Episode) -> float:
-    return float(np.mean(np.asarray(e.trace.force) ** 2)) if len(e.trace) else 0.0
-
-
 STEPS, VIOLATION = "control steps", "m or rad"
 ENDINGS = "success, collision, spill, blocked, violation, time_limit or simulation_failure"
 COLLISION = "contact force, or the task's own collision signal, above its limit"
 
 
-def _violations(compute: Callable[[str], Callable[[Any], float]]) -> list[Metric]:
-    """Return the metrics of the largest violation of commanded and measured poses, computed by `compute(name)`."""
-    meaning = "largest constraint violation of any {} pose; negative is slack"
-    pairs = [(f"max_{which}_violation", meaning.format(which)) for which in ("commanded", "measured")]
-    return [Metric(name, VIOLATION, meaning, compute(name)) for name, meaning in pairs]
+class Column(NamedTuple):
+    """Column of an episode's row; see `episode_row`."""
+
+    name: str
+    unit: str  # unit, or the quantity that is counted; "" if there is none
+    description: str  # definition in words
 
 
+VIOLATIONS = tuple(
+    Column(f"max_{which}_violation", VIOLATION, f"largest constraint violation of any {which} pose; negative is slack")
+    for which in ("commanded", "measured")
+)
 COLUMNS = (
-    Metric("episode", "", "number of the episode, from 0", lambda e: e.index),
-    Metric("return", "reward", "sum of all rewards, undiscounted", lambda e: e.total),
-    Metric("success", "", "1 if the task was done", lambda e: int(bool(e.info["is_success"]))),
-    Metric("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})", lambda e: e.termination),
-    Metric(
-        "steps", STEPS, "length (in actions if the environment does not count control steps)", lambda e: len(e.trace)
+    Column("episode", "", "number of the episode, from 0"),
+    Column("return", "reward", "sum of all rewards, undiscounted"),
+    Column("success", "", "1 if the task was done"),
+    Column("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})"),
+    Column("steps", STEPS, "length (in actions if the environment does not count control steps)"),
+    Column(
+        "peak_force", "N", "largest force of the impedance, or of the contact without an impedance, of any control step"
     ),
-    Metric(
-        "peak_force",
-        "N",
-        "largest force of the impedance, or of the contact without an impedance, of any control step",
-        _statistic("peak_force"),
-    ),
-    Metric(
-        "peak_contact_force",
-        "N",
-        "largest contact force of any control step, low-pass filtered (10 ms)",
-        _statistic("peak_contact_force"),
-    ),
-    Metric(
-        "quasi_static_force",
-        "N",
-        f"largest contact force that lasts {QUASI_STATIC_TIME:g} s",
-        _statistic("quasi_static_force"),
-    ),
-    Metric("mean_force", "N", "force as in peak_force, mean over control steps", _statistic("mean_force")),
-    Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
+    Column("peak_contact_force", "N", "largest contact force of any control step, low-pass filtered (10 ms)"),
+    Column("quasi_static_force", "N", f"largest contact force that lasts {QUASI_STATIC_TIME:g} s"),
+    Column("mean_force", "N", "force as in peak_force, mean over control steps"),
+    Column("mean_squared_force", "N²", "squared contact force, mean over control steps"),
     *(
-        Metric(f"jerk_{which}_{part}", unit, f"third derivative of the {which} {of}, mean norm", _jerk(which, part))
+        Column(f"jerk_{which}_{part}", unit, f"third derivative of the {which} {of}, mean norm")
         for which in ("commanded", "measured")
         for part, of, unit in (("linear", "position", "m/s³"), ("angular", "orientation (0 without one)", "rad/s³"))
     ),
-    *_violations(_statistic),
-    Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
-    Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
-    Metric("cost", STEPS, "control steps with a violated constraint or in collision", _count("cost")),
-    Metric("saturated_steps", STEPS, "control steps with the controller at a limit", _count("saturated_steps")),
-    Metric(
-        "fallback_steps",
-        STEPS,
-        "control steps at which guidance replaced the requested pose by a safe pose",
-        _count("fallback_steps"),
-    ),
+    *VIOLATIONS,
+    Column("collisions", "", f"collisions that began, of any duration ({COLLISION})"),
+    Column("collision_steps", STEPS, "control steps in collision"),
+    Column("cost", STEPS, "control steps with a violated constraint or in collision"),
+    Column("saturated_steps", STEPS, "control steps with the controller at a limit"),
+    Column("fallback_steps", STEPS, "control steps at which guidance replaced the requested pose by a safe pose"),
 )
 
 
-def episode_row(episode: Episode) -> dict[str, Any]:
-    """Return an episode's row: every column, and each reward term's sum as `reward_<term>`."""
-    row = {column.name: column.compute(episode) for column in COLUMNS}
-    return row | {f"reward_{name}": value for name, value in episode.terms.items()}
+def episode_row(
+    index: int, trace: EpisodeTrace, total: float, terms: Mapping[str, float], info: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return an episode's row: every column, and each reward term's sum as `reward_<term>`.
+
+    Args:
+        index: Number of the episode, from 0.
+        trace: Every control step.
+        total: Sum of the rewards that the environment returned.
+        terms: Sum of each reward term.
+        info: `info` of the last step.
+    """
+    values: dict[str, Any] = {**trace.statistics(), "episode": index, "return": total}
+    if not len(trace):  # the simulation failed at the first step: violations are those of the start
+        values["max_commanded_violation"] = info["constraint_violation"]
+        values["max_measured_violation"] = info["measured_violation"]
+    values["success"] = bool(info["is_success"])
+    failure = Termination.SIMULATION_FAILURE.value
+    values["termination"] = failure if "simulation_failure" in info else info["termination"]
+    values["mean_squared_force"] = float(np.mean(np.asarray(trace.force) ** 2)) if len(trace) else 0.0
+    for which in ("commanded", "measured"):
+        for part, value in jerk(getattr(trace, which), trace.period).items():
+            values[f"jerk_{which}_{part}"] = value
+    row = {name: int(values[name]) if name in COUNTS else values[name] for name, _, _ in COLUMNS}
+    return row | {f"reward_{name}": value for name, value in terms.items()}
 
 
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
@@ -289,7 +252,7 @@ _STATISTICS = (
     Metric("mean_force", "N", "each episode's mean force, mean over episodes", _mean("mean_force")),
     Metric("mean_squared_force", "N²", "mean squared force, mean over episodes", _mean("mean_squared_force")),
     Metric(SINCE, "N²", "mean squared force of the episodes after convergence", _force_since_convergence),
-    *_violations(_largest),
+    *(Metric(*column, _largest(column.name)) for column in VIOLATIONS),
     *(
         Metric(name, "", f"episodes with a {pose} outside the constraints", _violating(of))
         for name, pose, of in (

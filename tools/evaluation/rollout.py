@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 
@@ -19,9 +19,6 @@ from guiderail.tools.spaces import (
     has_layout,
     has_values,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def rollout(
@@ -54,7 +51,7 @@ def rollout(
             is invalid, an environment of another package raises an exception or breaks Gymnasium's contract
             (`checked_step`), or a callback returns wrong columns (`new_columns`).
     """
-    from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
+    from guiderail.tools.evaluation.metrics import episode_row, outside_row
 
     if not callable(act):
         act = as_policy(act)
@@ -93,7 +90,7 @@ def rollout(
             callback.on_step(transition)
         observation, is_over = next_observation, transition.is_last
     row = (
-        episode_row(Episode(index, base.trace, total, terms, info))
+        episode_row(index, base.trace, total, terms, info)
         if is_own
         else outside_row(index, total, infos, is_terminated=terminated)
     )
@@ -119,7 +116,7 @@ def _check_action(action: Any, env: gymnasium.Env) -> None:
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the columns that a callback adds to an episode's row."""
-    columns = callback.on_episode_end(row)
+    columns = callback.on_episode_end(row) or {}
     if not isinstance(columns, Mapping):
         raise InputError(f"{type(callback).__name__}.on_episode_end must return a dictionary, not {brief(columns)}")
     if taken := sorted(set(columns) & set(row)):

@@ -125,9 +125,8 @@ class _FittedSegment:
         self.num_steps = segment.steps_of(period)
         # A fit to long recordings takes seconds.
         say = partial(print, "guiderail:", file=sys.stderr, flush=True) if self.num_steps > LONG else None
-        self.selection: Selection = fit(
-            segment.recorded, num_steps=self.num_steps, floor=segment.floor, horizon=settings.horizon, log=say
-        )
+        recorded = segment.recorded.resampled(self.num_steps)
+        self.selection: Selection = fit(recorded, floor=segment.floor, horizon=settings.horizon, log=say)
         self.reference = self.selection.reference
         self.num_outputs = self.reference.num_outputs
         self.discrete = segment.discrete_values(self.num_steps)

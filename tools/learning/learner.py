@@ -12,7 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -44,27 +44,29 @@ def reject_bool(value: Any) -> Any:
 
 Positive = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(reject_bool)]
 NonNegative = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(reject_bool)]
+Symmetries = bool | Literal["near"]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LearnerConfig:
-    """Base class of the learners' configurations: the settings that the training loop reads.
+    """Base class of the learners' configurations: the settings that every learner has.
 
-    A learner adds its own settings in a derived pydantic dataclass, which is its attribute `Config`.
+    A learner adds its own settings in a derived pydantic dataclass, which is its attribute `Config`. The training loop
+    also reads the settings below that have no annotation here. A learner that supports one of them declares it as a
+    field of its configuration.
 
     Attributes:
         algorithm: Registered name of the learner.
+        stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
+            never. Resuming such a run runs no further episodes.
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
-            On-policy learners refuse it.
         pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
             older. The result is deterministic too.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
-        stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
-            never. Resuming such a run runs no further episodes.
         takes_images: True if the learner's networks accept observations with images.
         entries: Names of the fields that are entries of a structured setting; see `Options.entries`.
     """
@@ -73,11 +75,12 @@ class LearnerConfig:
     entries: ClassVar[Mapping[str, str]] = {}
 
     algorithm: str
-    demonstration_episodes: NonNegative = 0
-    symmetry: bool | Literal["near"] = False
-    pipelined: bool = False
-    num_envs: Annotated[NonNegative, Field(le=1024)] = 0
     stop_after_successes: NonNegative = 0
+
+    demonstration_episodes = 0
+    symmetry = cast("Symmetries", False)
+    pipelined = False
+    num_envs = 0
 
 
 class Learner(Callback, ABC):
@@ -90,10 +93,13 @@ class Learner(Callback, ABC):
 
     Attributes:
         Config: Configuration class, a pydantic dataclass derived from `LearnerConfig`.
+        stored: Names of the attributes that a resumed run continues from: arrays of at least one dimension, random
+            generators, and JSON-serializable values. None if the learner has its own `state` and `restore`.
         records_metrics: True if `metrics` will be read; set by the training loop.
     """
 
     Config: ClassVar[type[LearnerConfig]] = LearnerConfig
+    stored: ClassVar[tuple[str, ...] | None] = None
     records_metrics: bool = False
 
     @abstractmethod
@@ -125,22 +131,33 @@ class Learner(Callback, ABC):
         """Return the learned policy.
 
         Args:
-            description: Entries to add to the policy's description, such as the observation's shape.
+            description: Description of the policy: the observation's shape and the limits of an action. A learner may
+                add entries; see `Policy`.
         """
 
-    @abstractmethod
     def has_diverged(self) -> bool:
-        """Return True if a learned parameter is NaN or infinite."""
+        """Return True if a learned parameter is NaN or infinite; by default, if a stored array has such a number."""
+        return not all(np.isfinite(array).all() for array in self.state()[0].values())
 
-    @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return the state that a resumed run continues from; called between two episodes.
+        """Return the state that a resumed run continues from, by default `stored`; called between two episodes.
 
         Returns:
             Arrays of numbers by name (a 0-d array is restored with the shape (1,)), and JSON-serializable values.
-        """
 
-    @abstractmethod
+        Raises:
+            InputError: If `stored` is None and the class does not override this method.
+        """
+        if self.stored is None:
+            raise InputError(f"{type(self).__name__} names nothing in stored, and has no state() and restore()")
+        own = {name: getattr(self, name) for name in self.stored}
+        arrays = {name: value for name, value in own.items() if isinstance(value, np.ndarray)}
+        values = {name: value for name, value in own.items() if name not in arrays}
+        return arrays, {
+            name: value.bit_generator.state if isinstance(value, np.random.Generator) else value
+            for name, value in values.items()
+        }
+
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Restore a result of `state`.
 
@@ -152,6 +169,11 @@ class Learner(Callback, ABC):
             KeyError: If an entry is missing.
             RuntimeError, ValueError: If the state does not fit this learner.
         """
+        for name in self.stored or ():
+            if isinstance(generator := getattr(self, name), np.random.Generator):
+                generator.bit_generator.state = values[name]
+            else:
+                setattr(self, name, arrays[name] if isinstance(generator, np.ndarray) else values[name])
 
 
 def _check_learner(name: str, learner: Any) -> None:
@@ -171,11 +193,12 @@ LEARNERS: Registry[Any] = Registry(
 register_learner = LEARNERS.register
 
 
-def described_observation(env: gymnasium.Env) -> dict[str, Any]:
-    """Return the entries of a policy's description for an environment's observations."""
-    space = env.observation_space
+def describe_interface(env: gymnasium.Env) -> dict[str, Any]:
+    """Return the entries of a policy's description for an environment's observations and actions."""
+    space, actions = env.observation_space, cast(gymnasium.spaces.Box, env.action_space)
     image = getattr(space, "image_shape", None)
-    return {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
+    described = {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
+    return described | {"action_low": actions.low.tolist(), "action_high": actions.high.tolist()}
 
 
 def divergence_error() -> InputError:

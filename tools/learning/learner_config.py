@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -16,8 +16,8 @@ from pydantic.dataclasses import dataclass
 from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import did_you_mean, find_class
-from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
+from guiderail.models.common.registry import did_you_mean, find_plugins
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
 MAX_EPISODES = 10**9  # largest number of episodes of a run
@@ -65,6 +65,10 @@ class OffPolicyConfig(LearnerConfig):
     }
 
     algorithm: str = "tqc"  # registered name of the learner
+    demonstration_episodes: NonNegative = 0  # first episodes, in which a demonstrator acts
+    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
+    pipelined: bool = False  # learn in a second process, with weights that are one episode older
+    num_envs: Annotated[NonNegative, Field(le=1024)] = 0  # processes that simulate episodes; 0: only this one
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"  # interval that gamma discounts
@@ -101,29 +105,7 @@ class OffPolicyConfig(LearnerConfig):
             raise InputError("demonstration_episodes does not work with init_from: leave one of them out")
         if self.device == "cuda" and self.num_envs:
             raise InputError("parallel actors are forks, which cannot use cuda: leave num_envs or device=cuda out")
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Td3Config(OffPolicyConfig):
-    """Settings of twin delayed DDPG (TD3), by the names of Stable-Baselines3 where it has them."""
-
-    algorithm: str = "td3"
-    exploration_noise: Fraction = 0.1  # standard deviation of exploration noise, relative to half the action range
-    policy_delay: Positive = 2  # critic updates per actor update
-    target_policy_noise: Fraction = 0.2  # standard deviation of the noise of target actions
-    target_noise_clip: Fraction = 0.5  # largest noise of target actions
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class CrossQConfig(OffPolicyConfig):
-    """Settings of CrossQ, which has no target critics (`tau` has no effect)."""
-
-    algorithm: str = "crossq"
-    policy_delay: Positive = 3  # critic updates per actor update
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.dropout:
+        if self.dropout and self.algorithm == "crossq":
             raise InputError(
                 "crossq has no dropout, which replaces its batch normalization: leave "
                 f"net_arch.dropout={self.dropout:g} out"
@@ -132,7 +114,7 @@ class CrossQConfig(OffPolicyConfig):
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class OnPolicyConfig(LearnerConfig):
-    """Settings of an on-policy learner, by the names of Stable-Baselines3 where it has them."""
+    """Settings of an on-policy learner, PPO or TRPO, by the names of Stable-Baselines3 where it has them."""
 
     takes_images: ClassVar[bool] = False
     entries: ClassVar[Mapping[str, str]] = {"gamma_per": "gamma.per"}
@@ -141,16 +123,9 @@ class OnPolicyConfig(LearnerConfig):
     learning_rate: Rate = 3e-4
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"
-    gae_lambda: Factor = 0.95  # λ of generalized advantage estimation
     n_steps: Annotated[Positive, Field(ge=2, le=10**6)] = 256  # transitions between two trainings
     batch_size: BatchSize = 64  # transitions
     net_arch: NetArch = (64, 64)  # units of the hidden layers
-
-    def __post_init__(self) -> None:
-        if self.demonstration_episodes:
-            raise InputError(f"{self.algorithm} learns from its own actions: leave demonstration_episodes out")
-        if self.symmetry:
-            raise InputError(f"{self.algorithm} learns from no symmetric copies: leave symmetry out")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -158,16 +133,7 @@ class PpoConfig(OnPolicyConfig):
     """Settings of proximal policy optimization (PPO)."""
 
     n_epochs: Positive = 10  # passes through the transitions of a training
-    clip_range: Factor = 0.2  # difference from 1 at which an action's probability ratio is clipped
     ent_coef: Fraction = 0.0  # weight of the entropy in the loss
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class TrpoConfig(OnPolicyConfig):
-    """Settings of trust region policy optimization (TRPO)."""
-
-    algorithm: str = "trpo"
-    target_kl: Rate = 0.01  # largest Kullback-Leibler divergence between the policies before and after a training
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -178,6 +144,7 @@ class BcConfig(LearnerConfig):
 
     algorithm: str = "bc"
     demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
+    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
     learning_rate: Rate = 1e-3
     gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration
     batch_size: BatchSize = 64  # transitions
@@ -194,7 +161,7 @@ _TABLE_4_1 = OffPolicyConfig(
 _TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
 _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
-# The measurements behind each preset are in docs/experiments.md.
+# The measurements behind each preset are in research/experiments.md.
 PRESETS = {
     # Contact makes learning oscillate. Small batches, a moderate learning rate and layer normalization reduce the
     # oscillation. Greedy episodes train the critics on returns of the mean action. Checkpoint selection exports the
@@ -267,13 +234,16 @@ def resolve_preset(
     elif not issubclass(kind, OffPolicyConfig):
         raise InputError(f"the preset {preset} has settings that {algorithm} does not have: leave --preset out")
     base = {} if preset is None else setting_values(PRESETS[preset])
-    return make_config(algorithm, base | flat_options([kind], settings or {}))
+    return make_config(algorithm, base | flat_options(settings or {}))
 
 
 def config_class(algorithm: str) -> type[LearnerConfig]:
-    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported."""
-    kind: type[LearnerConfig] = find_class("learner_config", algorithm, LEARNERS, "Config")
-    return kind
+    """Return the class of a learner's settings; for a plug-in `learner_config`, PyTorch is not imported."""
+    if not LEARNERS.is_loaded(algorithm):
+        for name, point in find_plugins("learner_config"):
+            if name == algorithm:
+                return cast("type[LearnerConfig]", point.load())
+    return cast("type[LearnerConfig]", LEARNERS.get(algorithm).Config)
 
 
 def default_preset(algorithm: str) -> str | None:
@@ -285,7 +255,7 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
     """Validate settings against the configuration class of a learner; missing settings get its defaults."""
     kind = config_class(algorithm)
     names = option_fields(kind)
-    values = {**flat_options([kind], settings), "algorithm": algorithm}
+    values = {**flat_options(settings), "algorithm": algorithm}
     for name in values:
         if name not in names:
             known = names.keys() - {"algorithm"}
@@ -317,11 +287,6 @@ def check_episodes(episodes: object) -> int:
 def setting_values(config: LearnerConfig) -> dict[str, Any]:
     """Return the settings of a configuration by name."""
     return {name: getattr(config, field) for name, field in option_fields(type(config)).items()}
-
-
-def flat_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return settings with the entries of structured settings as settings of their own; see `flat_options`."""
-    return flat_options([OffPolicyConfig], settings or {})
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:

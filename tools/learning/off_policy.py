@@ -36,7 +36,7 @@ from guiderail.tools.learning.checkpoint import (
 )
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
-from guiderail.tools.learning.learner_config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
+from guiderail.tools.learning.learner_config import OffPolicyConfig, action_gamma
 from guiderail.tools.learning.networks import (
     DemonstrationReplayBuffer,
     ImageFeatures,
@@ -52,6 +52,8 @@ from guiderail.tools.learning.networks import (
     with_privileged,
 )
 
+TD3_NOISE = 0.1  # standard deviation of TD3's exploration noise, relative to half the action range
+
 
 class OffPolicyLearner(Learner):
     """Learner of an off-policy algorithm with the interface of Stable-Baselines3.
@@ -60,7 +62,6 @@ class OffPolicyLearner(Learner):
         algorithm: Class of the algorithm; a subclass sets it.
         fast_algorithm: The same algorithm with a faster training step, or None; used on the CPU, without
             dropout and without convolutions.
-        own_settings: Names of settings of a subclass's `Config` that the algorithm takes as arguments of the same name.
         config: Settings of the learner.
         model: Instance of the algorithm.
         averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
@@ -74,7 +75,6 @@ class OffPolicyLearner(Learner):
     Config = OffPolicyConfig
     algorithm: ClassVar[type]
     fast_algorithm: ClassVar[type | None] = None
-    own_settings: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -123,7 +123,6 @@ class OffPolicyLearner(Learner):
             "policy_kwargs": networks,
             "seed": seed,
             "device": config.device,
-            **{name: getattr(config, name) for name in self.own_settings},
         }
         is_fast = not config.dropout and not is_encoded and config.device == "cpu" and self.fast_algorithm is not None
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
@@ -448,7 +447,6 @@ def _array_key(array: np.ndarray | None) -> tuple[Any, ...]:
 class SacLearner(OffPolicyLearner):
     """Learner of soft actor-critic (SAC; Haarnoja et al., 2018)."""
 
-    Config = OffPolicyConfig
     algorithm = SAC
     fast_algorithm = FastSac
 
@@ -457,7 +455,6 @@ class SacLearner(OffPolicyLearner):
 class TqcLearner(OffPolicyLearner):
     """Learner of truncated quantile critics (TQC; Kuznetsov et al., 2020)."""
 
-    Config = OffPolicyConfig
     algorithm = TQC
     fast_algorithm = FastTqc
 
@@ -466,23 +463,17 @@ class TqcLearner(OffPolicyLearner):
 class Td3Learner(OffPolicyLearner):
     """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with Gaussian noise."""
 
-    Config = Td3Config
     algorithm = TD3
-    own_settings = ("policy_delay", "target_policy_noise", "target_noise_clip")
-    config: Td3Config
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
         """Return the action plus noise, clipped to the action space."""
         action, space = super().explore(observation), self.model.action_space
-        deviation = self.config.exploration_noise * (space.high - space.low) / 2
+        deviation = TD3_NOISE * (space.high - space.low) / 2
         return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
 
 
 @register_learner("crossq")
 class CrossQLearner(OffPolicyLearner):
-    """Learner of CrossQ (Bhatt et al., 2024): batch normalization in place of target critics."""
+    """Learner of CrossQ (Bhatt et al., 2024): batch normalization in place of target critics, so no `tau`."""
 
-    Config = CrossQConfig
     algorithm = CrossQ
-    own_settings = ("policy_delay",)
-    config: CrossQConfig

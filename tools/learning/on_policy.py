@@ -20,7 +20,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import module_arrays, random_state, restore_modules, restore_random
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
-from guiderail.tools.learning.learner_config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
+from guiderail.tools.learning.learner_config import OnPolicyConfig, PpoConfig, action_gamma
 from guiderail.tools.learning.networks import export_layers
 
 _BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
@@ -63,7 +63,6 @@ class OnPolicyLearner(Learner):
             n_steps=config.n_steps,
             batch_size=min(config.batch_size, config.n_steps),
             gamma=action_gamma(config, action_repeat),
-            gae_lambda=config.gae_lambda,
             policy_kwargs={"net_arch": list(config.net_arch)},
             seed=seed,
             device="cpu",
@@ -164,13 +163,11 @@ class PpoLearner(OnPolicyLearner):
 
     Config = PpoConfig
     algorithm = PPO
-    own_settings = ("n_epochs", "clip_range", "ent_coef")
+    own_settings = ("n_epochs", "ent_coef")
 
 
 @register_learner("trpo")
 class TrpoLearner(OnPolicyLearner):
     """Learner of trust region policy optimization (TRPO; Schulman et al., 2015)."""
 
-    Config = TrpoConfig
     algorithm = TRPO
-    own_settings = ("target_kl",)

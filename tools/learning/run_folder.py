@@ -24,6 +24,7 @@ from pydantic import ConfigDict, Field, SkipValidation
 from pydantic.dataclasses import dataclass
 from safetensors import SafetensorError, safe_open
 
+from guiderail.diagrams.envs.options import flat_options
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
@@ -45,7 +46,6 @@ from guiderail.tools.learning.learner_config import (
     check_episodes,
     config_values,
     default_preset,
-    flat_settings,
     make_config,
     resolve_preset,
 )
@@ -334,7 +334,7 @@ def configure(
     """
     has_learner = choices.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     declared: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
-    settings = flat_settings(declared.pop("settings", None)) | flat_settings(choices.get("settings"))
+    settings = flat_options(declared.pop("settings", {})) | flat_options(choices.get("settings") or {})
     chosen: dict[str, Any] = declared | choices | {"settings": settings}
     episodes, seed = check_episodes(chosen.get("episodes", DEFAULT_EPISODES)), chosen.get("seed", DEFAULT_SEED)
     learner = resolve_preset(chosen.get("preset"), chosen.get("algorithm"), settings)
@@ -380,7 +380,7 @@ def resumed_config(
             f"the run in {folder.path} has another set of environments: leave the tasks and --variants out, or train "
             "again in another folder"
         )
-    values = config_values(config.learner) | flat_settings(settings)
+    values = config_values(config.learner) | flat_options(settings or {})
     algorithm = values.pop("algorithm")
     if make_config(algorithm, values) != config.learner:
         raise InputError(

@@ -34,7 +34,7 @@ from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
     LearningLog,
-    described_observation,
+    describe_interface,
     divergence_error,
     learner_arguments,
 )
@@ -349,7 +349,7 @@ class TrainingLoop:
         config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
         try:
             with _naming_failures(config, name, ValueError):
-                policy = self._learner.policy({"task": config.task, **described_observation(self._episodes.env)})
+                policy = self._learner.policy({"task": config.task, **describe_interface(self._episodes.env)})
         except InputError:
             raise
         except ValueError as error:

@@ -15,8 +15,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage import demonstrations as narrow_passage
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry, load_demonstrations
 from guiderail.tools.evaluation.metrics import VIOLATION, WORDS, episodes_to_convergence
 from guiderail.tools.files import check_picture, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
@@ -117,7 +116,7 @@ def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False
     axis.add_patch(Circle(passage.obstacle, passage.obstacle_radius, color="saddlebrown", label=obstacle))
     axis.add_patch(Circle(passage.goal, passage.goal_radius, color="tab:green", alpha=0.4, label=goal))
     if demonstrations:
-        for index, path in enumerate(narrow_passage.load().outputs):
+        for index, path in enumerate(load_demonstrations().outputs):
             axis.plot(*path.T, color="0.75", linewidth=0.6, label="" if index else path_label)
     axis.set(xlim=(0.1, 0.8), ylim=(0.0, 1.02), aspect="equal", xlabel="x [m]", ylabel="y [m]")
 

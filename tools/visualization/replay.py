@@ -25,7 +25,7 @@ from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.command_checks import ConstraintViolation
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn, Transition

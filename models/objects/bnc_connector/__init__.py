@@ -1,1 +1,462 @@
-"""BNC connector."""
+"""BNC bayonet connector at true scale: geometry, files for Drake, and convex solids for other physics engines.
+
+The jack has two lugs, and the ring of the plug two slots.
+
+Frames. The origin of the jack frame J is the bottom of the barrel's center line; z points along the barrel to its open
+end, and x through the lugs. The origin of the plug frame P is the center of the ring's mouth; z points from the mouth
+to the cable, and x through the entries of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by
+minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
+
+Contact. The ring has three open rigid surfaces: the mouth's flat face, and its chamfer with the bore, which collide
+only with the barrel, and a pair of slots that collide only with the lugs. These surfaces have a third of the triangles
+of a closed ring, and their contact is computed five times faster. The corner between face and chamfer is a lip, a
+shallow cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant
+primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their detents.
+
+`python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.common.transforms import MM
+from guiderail.models.objects.sdf import (
+    ContactMaterial,
+    TriangleMesh,
+    at,
+    box,
+    collision,
+    cylinder,
+    cylindrical,
+    equal_area_radius,
+    generate_assets,
+    lathe,
+    mesh,
+    model,
+    strip,
+    visual,
+)
+from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
+
+FOLDER = Path(__file__).parent
+JACK_SDF = FOLDER / "bnc_jack.sdf"
+PLUG_SDF = FOLDER / "bnc_plug.sdf"
+BORE_SIDES = 24  # sides of the polygon that approximates the bore
+LIP_WIDTH, LIP_RISE = 0.1 * MM, 0.015 * MM  # size of the lip at the mouth's inner corner [m]
+
+
+@dataclass(frozen=True)
+class BncDimensions:
+    """Dimensions in meters and radians; the slot's heights are heights of a lug's center above the mouth."""
+
+    barrel_radius: float = 4.825 * MM
+    barrel_height: float = 10.0 * MM
+    lug_radius: float = 0.975 * MM
+    lug_tip_radius: float = 5.5 * MM  # from the center line to the end of a lug
+    lug_root_radius: float = 4.025 * MM  # from the center line to the start of a lug, inside the barrel
+    lug_depth: float = 5.5 * MM  # depth of a lug's center below the barrel's open end
+
+    bore_radius: float = 4.925 * MM
+    ring_radius: float = 7.0 * MM
+    ring_length: float = 9.5 * MM
+    mouth_chamfer: float = 0.4 * MM
+    slot_clearance: float = 0.125 * MM  # clearance between lug and slot on each side
+    slot_depth: float = 0.9 * MM  # radial depth of the slots' walls
+
+    entry_height: float = 3.4 * MM  # upper end of the straight entry
+    entry_angle: float = np.deg2rad(6.0)  # angle at which the ramp starts
+    apex_height: float = 5.4 * MM
+    apex_angle: float = np.deg2rad(78.0)
+    detent_height: float = 5.0 * MM
+    detent_start_angle: float = np.deg2rad(87.0)
+    detent_angle: float = np.deg2rad(90.0)
+
+    pad_radius: float = 3.0 * MM
+    pad_height: float = 0.6 * MM  # height of the pad's top above the barrel's open end
+    pad_thickness: float = 2.0 * MM
+    seat_height: float = 10.7 * MM  # height above the mouth of the plug's face that touches the pad
+    seat_width: float = 8.0 * MM
+    seat_thickness: float = 2.0 * MM
+    shell_radius: float = 5.0 * MM  # radius of the shell, where the tool holds the plug
+    shell_length: float = 16.0 * MM
+
+    @property
+    def bore_clearance(self) -> float:
+        """Clearance between barrel and bore on each side [m]."""
+        return round(self.bore_radius - self.barrel_radius, 9)
+
+    def with_bore_clearance(self, clearance: float) -> "BncDimensions":
+        """Return the dimensions with the bore's radius changed to another clearance on each side [m]."""
+        return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
+
+    @property
+    def lug_height(self) -> float:
+        """Height of the lugs' centers in J [m]."""
+        return self.barrel_height - self.lug_depth
+
+    @property
+    def locked_height(self) -> float:
+        """Height of P in J with the lugs in the detents [m]."""
+        return self.lug_height - self.detent_height
+
+    @property
+    def slot_radius(self) -> float:
+        """Radius at which the slot's outline is unrolled, slightly outside the barrel [m]."""
+        return self.barrel_radius + 0.3 * MM
+
+    @property
+    def slot_half_width(self) -> float:
+        """Radius of the mill that cuts the slot [m]."""
+        return self.lug_radius + self.slot_clearance
+
+
+@dataclass(frozen=True)
+class SlotColumns:
+    """Unrolled slot: the heights (n,) of the walls below and above it [m] at the angles (n,) [rad]."""
+
+    angles: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    num_entry: int  # columns 0 … num_entry are the entry, which is open towards the mouth
+
+
+def slot_columns(dimensions: BncDimensions) -> SlotColumns:
+    """Return the walls that a mill of radius `slot_half_width` leaves along the lug's path."""
+    d = dimensions
+    radius, half_width = d.slot_radius, d.slot_half_width
+    num_entry, num_ramp, num_end = 6, 14, 3  # columns of each part
+    knots = np.array(
+        [
+            [0.0, 0.0],
+            [0.0, d.entry_height],
+            [d.entry_angle, d.entry_height],
+            [d.apex_angle, d.apex_height],
+            [d.detent_start_angle, d.detent_height],
+            [d.detent_angle, d.detent_height],
+        ]
+    ) * [radius, 1.0]
+    path = np.concatenate(
+        [start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start) for start, end in itertools.pairwise(knots)]
+    )
+    last = knots[-1, 0]
+    arcs = np.concatenate(
+        [
+            -half_width * np.cos(np.linspace(0.0, np.pi, num_entry + 1)),
+            np.linspace(half_width, last, num_ramp + 1)[1:],
+            last + half_width * np.sin(np.linspace(0.0, np.pi / 2, num_end + 1))[1:],
+        ]
+    )
+
+    def walls(arc: float) -> tuple[float, float]:
+        distance = np.abs(path[:, 0] - np.clip(arc, -half_width + 1e-9, last + half_width - 1e-9))
+        near = distance <= half_width
+        reach = np.sqrt(half_width**2 - distance[near] ** 2)
+        return float(np.min(path[near, 1] - reach)), float(np.max(path[near, 1] + reach))
+
+    lower, upper = np.array([walls(arc) for arc in arcs]).T
+    lower[: num_entry + 1] = walls(half_width + 1e-10)[0]  # the entry's right-hand wall ends where the ramp begins
+    lower[-1] = upper[-1] = 0.5 * (lower[-1] + upper[-1])  # the round end of the slot
+    return SlotColumns(arcs / radius, lower, upper, num_entry)
+
+
+def _both_halves(quads: np.ndarray) -> np.ndarray:
+    return np.concatenate([quads, quads * [-1.0, -1.0, 1.0]])
+
+
+def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) -> np.ndarray:
+    """Return the walls along the slot's outline, from the mouth around the detent and back, as quads (Q, 4, 3) [m]."""
+    d, columns = dimensions, slot_columns(dimensions)
+    entry_left, entry_right = columns.angles[0], columns.angles[columns.num_entry]
+    ramp = slice(columns.num_entry, None)
+    outline = np.concatenate(
+        [
+            [[entry_right + chamfer / d.slot_radius, 0.0], [entry_right, chamfer]],
+            np.stack([columns.angles[ramp], columns.lower[ramp]], axis=1),
+            np.stack([columns.angles, columns.upper], axis=1)[-2::-1],
+            [[entry_left, chamfer], [entry_left - chamfer / d.slot_radius, 0.0]],
+        ]
+    )
+    return strip(
+        cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
+        cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
+    )
+
+
+def _faces_between_entries(
+    dimensions: BncDimensions, radii: tuple[float, float], margin: float, height: float, num_sides: int
+) -> np.ndarray:
+    """Return the half of the mouth's flat face between the entries of the two slots, as quads (Q, 4, 3) [m]."""
+    columns = slot_columns(dimensions)
+    angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
+    return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))
+
+
+def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the mesh that collides with the lugs: walls of the slots, and the mouth's face with chamfered entries."""
+    d = dimensions
+    outer_radius = d.bore_radius + d.slot_depth
+    walls = _slot_walls(d, outer_radius, d.mouth_chamfer)
+    face = _faces_between_entries(
+        d, (d.bore_radius + d.mouth_chamfer, outer_radius), d.mouth_chamfer / d.slot_radius, 0.0, num_sides=17
+    )
+    return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
+
+
+def face_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the mouth's flat face, from the outer edge of the ring to the lip."""
+    return _lathe([(dimensions.ring_radius, 0.0), _lip_edge(dimensions)])
+
+
+def bore_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the lip at the mouth's face, the chamfer and the wall of the bore."""
+    d = dimensions
+    corner = (d.bore_radius + d.mouth_chamfer - LIP_RISE, LIP_RISE)
+    return _lathe([_lip_edge(d), corner, (d.bore_radius, d.mouth_chamfer), (d.bore_radius, d.ring_length)])
+
+
+def _lip_edge(d: BncDimensions) -> tuple[float, float]:
+    return d.bore_radius + d.mouth_chamfer + LIP_WIDTH, 0.0
+
+
+def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
+    """Return a surface of revolution whose polygons have the areas of the circles."""
+    scale = equal_area_radius(1.0, BORE_SIDES)
+    return lathe([(radius * scale, height) for radius, height in profile], BORE_SIDES)
+
+
+def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the visual mesh of the ring, with slots cut through so that the lugs are visible."""
+    d, columns = dimensions, slot_columns(dimensions)
+    ramp = slice(columns.num_entry, None)
+    plain_angles = np.linspace(columns.angles[-1], np.pi + columns.angles[0], 9)
+
+    def shell(angles: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> list[np.ndarray]:
+        low_in, high_in = (cylindrical(d.bore_radius, angles, height) for height in (low, high))
+        low_out, high_out = (cylindrical(d.ring_radius, angles, height) for height in (low, high))
+        return [strip(low_in, high_in), strip(high_out, low_out)]
+
+    radii = (d.bore_radius, d.ring_radius)
+    all_angles = np.concatenate([columns.angles, plain_angles[1:]])
+    quads = (
+        shell(columns.angles, columns.upper, d.ring_length)
+        + shell(columns.angles[ramp], 0.0, columns.lower[ramp])
+        + shell(plain_angles, 0.0, d.ring_length)
+        + [_slot_walls(d, d.ring_radius, chamfer=0.0)]
+        + [_faces_between_entries(d, radii, 0.0, 0.0, num_sides=24)]
+        + [strip(cylindrical(radii[0], all_angles, d.ring_length), cylindrical(radii[1], all_angles, d.ring_length))]
+    )
+    return TriangleMesh.from_quads(_both_halves(np.concatenate(quads)))
+
+
+BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
+
+FRICTION = 0.2  # friction coefficient of metal on metal
+# Distance at which contact with the mouth's face and the slots begins [m]. Without a margin the plug moves into the
+# jack for a whole time step, and the next step ejects it. A discrete plant extrapolates the pressure along the normal
+# of each contact polygon, so a surface within its margin holds back a plug that would slide past it: a chamfer does,
+# with a force that depends on the time step. Chamfer and bore therefore touch a barrel without a margin, and the
+# mouth's face, whose normal is the axis, another one.
+MARGIN = 0.1 * MM
+# Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
+# than with metal parts (docs/experiments.md, "Center of pressure on the rim").
+BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM)
+LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
+PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # models the gasket as a soft spring
+RING = ContactMaterial(friction=FRICTION)
+SEAT = ContactMaterial(friction=0.05)
+
+PLUG_MASS = 0.03  # [kg]
+
+TOUCHING: dict[str, str] = {
+    "barrel": "bore", "barrel_end": "face", "lug_0": "slots", "lug_1": "slots", "pad": "seat",
+}  # fmt: skip
+"""Surface of the plug that each surface of the jack can touch."""
+
+
+def barrel_sides(dimensions: BncDimensions) -> int:
+    """Return the number of sides of Drake's polygon of the barrel; no side is longer than the resolution hint."""
+    assert BARREL.resolution is not None
+    return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
+
+
+def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
+    """Return the jack's model: link `jack` is frame J, with the surfaces of `TOUCHING`.
+
+    `friction` applies to barrel and lugs. The collision geometry of the barrel is a polygon with the area of its
+    circle.
+    """
+    d = dimensions
+    barrel_material, lug_material = (replace(metal, friction=friction) for metal in (BARREL, LUG))
+    center = at(z=d.barrel_height / 2)
+    barrel = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
+    pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
+    lug_length = d.lug_tip_radius - d.lug_root_radius
+    lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    contents = collision("barrel", center, barrel, barrel_material)
+    contents += collision("barrel_end", center, barrel, replace(barrel_material, margin=MARGIN))
+    contents += visual("barrel_visual", center, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
+    contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
+    for number, side in enumerate((1.0, -1.0)):
+        lug = (at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
+        contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
+    return model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
+
+
+def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
+    """Return the plug's model: link `plug` is frame P, with the surfaces of `TOUCHING`.
+
+    `friction` applies to all of them but the seat.
+    """
+    d, ring = dimensions, replace(RING, friction=friction)
+    seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
+    shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
+    contents = "".join(collision(name, at(), mesh(f"bnc_{name}.obj"), ring) for name in ("face", "bore", "slots"))
+    contents += collision("seat", *seat, SEAT)
+    contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
+    contents += visual("shell_visual", *shell, BRASS)
+    return model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
+
+
+def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, str]:
+    """Return the content of each file by name; `friction` applies to the metal."""
+    return {
+        "bnc_face.obj": face_mesh(dimensions).to_obj(),
+        "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
+        "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
+        "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction),
+        "bnc_plug.sdf": plug_sdf(dimensions, friction),
+    }
+
+
+def folder_of(dimensions: BncDimensions, friction: float = FRICTION) -> Path:
+    """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments."""
+    if (dimensions, friction) == (BncDimensions(), FRICTION):
+        return FOLDER
+    return generate_assets(files, dimensions, friction)
+
+
+MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism between the slots; its face is then 7 µm inside the circle
+# The gasket is a rigid disc on a spring. Up to a compression of 0.6 mm, its force differs from the force of Drake's pad
+# by at most 20 %.
+PAD_STIFFNESS = 1.5e5  # [N/m]
+
+
+def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
+    """Return the collision geometry of the jack in its frame J."""
+    d = dimensions
+    shape = Cylinder(d.barrel_radius, d.barrel_height)
+    barrel = Surface("barrel", "bore", shape, friction, (0.0, 0.0, d.barrel_height / 2))
+    shape, center = Cylinder(d.pad_radius, d.pad_thickness), d.barrel_height + d.pad_height - d.pad_thickness / 2
+    spring = Spring((0.0, 0.0, 1.0), PAD_STIFFNESS)
+    pad = Surface("pad", "pad", shape, PAD.friction, (0.0, 0.0, center), spring=spring)
+    center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    shape = Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius)
+    lugs = [
+        Surface(f"lug_{number}", "slots", shape, friction, (side * center, 0.0, d.lug_height), pitch=np.pi / 2)
+        for number, side in enumerate((1.0, -1.0))
+    ]
+    return [barrel, pad, *lugs]
+
+
+def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
+    """Return the collision geometry of the plug in its frame P."""
+    d = dimensions
+    surfaces = [
+        Surface(f"{pair}_{number}", pair, Hull(vertices), friction)
+        for pair, hulls in (("bore", bore_hulls(d)), ("slots", slot_hulls(d)))
+        for number, vertices in enumerate(hulls)
+    ]
+    seat = (0.0, 0.0, d.seat_height + d.seat_thickness / 2)
+    return [*surfaces, Surface("seat", "pad", Box(d.seat_width, d.seat_width, d.seat_thickness), PAD.friction, seat)]
+
+
+def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
+    """Return the vertices (20, 3) [m] of the convex pieces of the ring, whose polygons enclose the bore."""
+    d = dimensions
+    profile = [
+        [d.bore_radius + d.mouth_chamfer, 0.0],
+        [d.ring_radius, 0.0],
+        [d.ring_radius, d.ring_length],
+        [d.bore_radius, d.ring_length],
+        [d.bore_radius, d.mouth_chamfer],
+    ]
+    return ring_hulls(np.array(profile), BORE_SIDES)
+
+
+def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
+    """Return the vertices (V, 3) [m] of the convex pieces of the ring with both slots cut.
+
+    The pieces are prisms over, under and between the slots.
+    """
+    outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_between_the_slots(dimensions)]
+    return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
+
+
+Outline = list[list[float]]
+"""Corners [angle [rad], height [m]] of a prism in any order."""
+
+
+def _prism(outline: np.ndarray, d: BncDimensions) -> np.ndarray:
+    angle, height = outline.T
+    return np.concatenate([cylindrical(radius, angle, height) for radius in (d.bore_radius, d.ring_radius)])
+
+
+def _over_the_slot(d: BncDimensions) -> list[Outline]:
+    columns = slot_columns(d)
+    a, wall = columns.angles, columns.upper
+    return [
+        [[a[i], wall[i]], [a[i + 1], wall[i + 1]], [a[i + 1], d.ring_length], [a[i], d.ring_length]]
+        + _shoulders(d, a, wall, i, facing=-1.0)
+        for i in range(len(a) - 1)
+    ]
+
+
+def _under_the_ramp(d: BncDimensions) -> list[Outline]:
+    columns = slot_columns(d)
+    a, wall, first = columns.angles, columns.lower, columns.num_entry
+    wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
+    outlines = []
+    for i in range(first, len(a) - 1):
+        outline = [[a[i + 1], 0.0], [a[i + 1], wall[i + 1]], [a[i], wall[i]], [a[i + 1] + wide, BELOW]]
+        if i == first:  # chamfer at the entry
+            outline += [[a[i], d.mouth_chamfer], [a[i] + chamfer, 0.0]]
+        else:
+            outline += [[a[i], 0.0], [a[i] - wide, BELOW]]
+        outlines.append(outline + _shoulders(d, a, wall, i, facing=1.0, left=i != first))
+    return outlines
+
+
+def _between_the_slots(d: BncDimensions) -> list[Outline]:
+    """Return prisms from the end of one slot to the chamfered entry of the other slot."""
+    angles, top = slot_columns(d).angles, d.ring_length
+    wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
+    begin, end = angles[-1], np.pi + angles[0]
+    edges = np.linspace(begin, end, 2 + int((end - begin) / MAX_ANGLE))
+    outlines = []
+    for left, right in itertools.pairwise(edges):
+        outline = [[left, 0.0], [right, top], [left, top]]
+        if left != begin:
+            outline += [[left - wide, BELOW]]
+        if right == end:
+            outline += [[right - chamfer, 0.0], [right, d.mouth_chamfer]]
+        else:
+            outline += [[right, 0.0], [right + wide, BELOW]]
+        outlines.append(outline)
+    return outlines
+
+
+def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing: float, left: bool = True) -> Outline:
+    """Return the shoulders of the edge from column i to i + 1 of a wall; `facing` is 1 for up and −1 for down."""
+    wide, h = SHOULDER / d.slot_radius, facing * wall
+    slope = (h[i + 1] - h[i]) / (a[i + 1] - a[i])
+    # A shoulder is below the line of the edge and below the wall; the right one is also below the edge's right end.
+    right_surface = min(np.interp(a[i + 1] + wide, a, h), h[i + 1])
+    points = [[a[i + 1] + wide, facing * (min(h[i + 1] + slope * wide, right_surface) - BELOW)]]
+    if left:
+        left_surface = np.interp(a[i] - wide, a, h)
+        points.append([a[i] - wide, facing * (min(h[i] - slope * wide, left_surface) - BELOW)])
+    return points

@@ -1,1 +1,340 @@
-"""Grid clamp and its table."""
+"""Grid clamp with five pegs and the part of a table with the holes: geometry, files for Drake, and convex solids.
+
+Frames. The table's frame G lies in its surface at the center of the middle hole, z up. The clamp's frame C lies at the
+tip of the middle peg, z up along the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), with its shoulder
+on the table.
+
+Contact. Every hole is an open rigid surface that collides only with its own peg. It consists of the face around the
+hole, a chamfer and a short wall; a wall of the hole's full depth would take half of the simulation time. Pegs are
+compliant convex solids with as many sides as their holes, so that the clearance is exact with few triangles. The middle
+hole has a lip and the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains
+the clamp. The body is a soft pad, thick enough for impacts, that collides only with the table's slab.
+
+`python -m research.generate clamp-objects` writes the SDF and OBJ files in this folder.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.common.transforms import MM
+from guiderail.models.objects.sdf import (
+    ContactMaterial,
+    TriangleMesh,
+    at,
+    box,
+    collision,
+    convex_mesh,
+    cylinder,
+    cylindrical,
+    generate_assets,
+    lathe,
+    mesh,
+    model,
+    strip,
+    visual,
+)
+from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls
+
+FOLDER = Path(__file__).parent
+CLAMP_SDF = FOLDER / "grid_clamp.sdf"
+TABLE_SDF = FOLDER / "grid_table.sdf"
+NUM_SIDES = 6  # sides of a polygon in collision geometry
+NUM_VISUAL_SIDES = 12  # sides of a polygon in visual geometry
+
+
+@dataclass(frozen=True)
+class GridClampDimensions:
+    """Dimensions in meters. Radii are of the circles inside the polygons; depths are measured from the table's face."""
+
+    peg_radius: float = 4.0 * MM
+    peg_length: float = 12.0 * MM  # from the shoulder to the tip
+    peg_chamfer: float = 0.6 * MM
+    spacing: float = 20.0 * MM  # distance of the outer pegs from the middle one along x and along y
+
+    hole_radius: float = 4.15 * MM
+    hole_chamfer: float = 0.5 * MM
+    hole_land: float = 3.0 * MM  # depth to which the collision geometry of the wall reaches
+    hole_depth: float = 13.0 * MM
+    face_radius: float = 14.0 * MM  # radius of the face around a hole, for a misaligned peg
+
+    lip_radius: float = 4.15 * MM
+    lip_depth: float = 0.6 * MM  # depth of the upper end of the narrow part
+    lip_land: float = 0.4 * MM  # height of the narrow part
+    lip_flank: float = 0.4 * MM  # size of the flanks, at 45 degrees
+    bead_radius: float = 4.35 * MM
+    bead_depth: float = 1.5 * MM  # depth of the bead's crest with the shoulder on the table
+    bead_entry: float = 1.2 * MM  # length of the flank that touches the lip first
+    bead_exit: float = 0.6 * MM
+
+    shoulder_width: float = 56.0 * MM
+    body_height: float = 8.0 * MM
+    table_width: float = 96.0 * MM
+    table_thickness: float = 14.0 * MM
+
+    @property
+    def clearance(self) -> float:
+        """Clearance between a peg and its hole on each side [m]."""
+        return round(self.hole_radius - self.peg_radius, 9)
+
+    def with_clearance(self, clearance: float) -> "GridClampDimensions":
+        """Return the dimensions with the holes' radius changed to another clearance [m]; the lip does not change."""
+        return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
+
+    @property
+    def peg_positions(self) -> np.ndarray:
+        """Centers (5, 2) [m] of the pegs in C and of the holes in G: the middle one, then the corners."""
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+        return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
+
+
+def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
+    """Return the mesh of a profile of (radius, height) [m], with circumscribed polygons for circles."""
+    return lathe([(radius / np.cos(np.pi / NUM_SIDES), height) for radius, height in profile], NUM_SIDES)
+
+
+def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """Return the collision mesh of a hole: wall, chamfer and face; the origin is the hole's center in the face."""
+    d = dimensions
+    return _lathe(
+        [
+            (d.hole_radius, -d.hole_land),
+            (d.hole_radius, -d.hole_chamfer),
+            (d.hole_radius + d.hole_chamfer, 0.0),
+            (d.face_radius, 0.0),
+        ]
+    )
+
+
+def lip_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """Return the collision mesh of the lip, a ring that narrows and widens, in the frame of the middle hole's mesh."""
+    d = dimensions
+    top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
+    return _lathe(
+        [
+            (d.lip_radius + d.lip_flank, bottom - d.lip_flank),
+            (d.lip_radius, bottom),
+            (d.lip_radius, top),
+            (d.lip_radius + d.lip_flank, top + d.lip_flank),
+        ]
+    )
+
+
+def peg_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """Return a peg as a convex solid; the origin is its tip."""
+    d = dimensions
+    return _lathe(
+        [
+            (0.0, d.peg_length),
+            (d.peg_radius, d.peg_length),
+            (d.peg_radius, d.peg_chamfer),
+            (d.peg_radius - d.peg_chamfer, 0.0),
+            (0.0, 0.0),
+        ]
+    )
+
+
+def bead_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """Return the bead as a convex solid around the middle peg; the origin is its crest."""
+    d = dimensions
+    return _lathe(
+        [
+            (0.0, d.bead_exit),
+            (d.peg_radius, d.bead_exit),
+            (d.bead_radius, 0.0),
+            (d.peg_radius, -d.bead_entry),
+            (0.0, -d.bead_entry),
+        ]
+    )
+
+
+def slab_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """Return the visual mesh of the table: face, holes and sides."""
+    d = dimensions
+    angles = 2.0 * np.pi * (np.arange(NUM_VISUAL_SIDES + 1) + 0.5) / NUM_VISUAL_SIDES
+    half_cell, half_table = d.spacing / 2, d.table_width / 2
+    on_cell = half_cell / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    bottom, wall, mouth = (
+        cylindrical(radius, angles, height)
+        for radius, height in (
+            (d.hole_radius, -d.hole_depth),
+            (d.hole_radius, -d.hole_chamfer),
+            (d.hole_radius + d.hole_chamfer, 0.0),
+        )
+    )
+    hole = np.concatenate([strip(bottom, wall), strip(wall, mouth), strip(mouth, cylindrical(on_cell, angles, 0.0))])
+    quads = [hole + np.array([x, y, 0.0]) for x, y in d.peg_positions]
+    # The cells without a hole, and the frame around the three by three cells.
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    sides = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    quads.append(half_cell * corners + d.spacing * sides[:, None])
+    outer, inner = half_table * corners, 3 * half_cell * corners
+    below = outer - [0.0, 0.0, d.table_thickness]
+    quads.append(np.stack([outer, np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0), inner], axis=1))
+    quads.append(np.stack([below, np.roll(below, -1, axis=0), np.roll(outer, -1, axis=0), outer], axis=1))
+    return TriangleMesh.from_quads(np.concatenate(quads))
+
+
+STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
+GLASS = "0.20 0.35 0.60 0.3"  # transparent body, so that pegs and holes are visible
+
+FRICTION = 0.2  # friction coefficient of pegs, holes and the table's face
+PEG = ContactMaterial(friction=FRICTION, modulus=5e8)
+BEAD = ContactMaterial(friction=0.1, modulus=2e7)
+PAD = ContactMaterial(friction=FRICTION, modulus=1e6)
+HOLE = ContactMaterial(friction=FRICTION)
+LIP = ContactMaterial(friction=0.1)
+SLAB = ContactMaterial(friction=FRICTION)
+
+CLAMP_MASS = 0.15  # [kg]
+STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem, where the tool holds the clamp [m]
+
+
+def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
+    """Return the clamp's model: link `clamp` is frame C, with geometry `peg_0` (middle) to `peg_4`, `bead`, `pad`."""
+    d, peg_material, pad = dimensions, *(replace(surface, friction=friction) for surface in (PEG, PAD))
+    contents = ""
+    for number, (x, y) in enumerate(d.peg_positions):
+        contents += collision(f"peg_{number}", at(x, y), convex_mesh("grid_clamp_peg.obj"), peg_material)
+        shaft = (at(x, y, d.peg_length / 2), cylinder(d.peg_radius, d.peg_length))
+        contents += visual(f"peg_{number}_visual", *shaft, STEEL)
+    crest = at(z=d.peg_length - d.bead_depth)
+    contents += collision("bead", crest, convex_mesh("grid_clamp_bead.obj"), BEAD)
+    contents += visual("bead_visual", crest, mesh("grid_clamp_bead.obj"), ANODIZED)
+    top = d.peg_length + d.body_height
+    body = (at(z=d.peg_length + d.body_height / 2), box(d.shoulder_width, d.shoulder_width, d.body_height))
+    contents += collision("pad", *body, pad)
+    contents += visual("body_visual", *body, GLASS)
+    contents += visual("stem_visual", at(z=top + STEM_LENGTH / 2), cylinder(STEM_RADIUS, STEM_LENGTH), STEEL)
+    return model("clamp", CLAMP_MASS, (0.0, 0.0, d.peg_length), 20.0 * MM, contents)
+
+
+def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
+    """Return the table's model: link `table` is frame G, with geometry `hole_0` (middle) to `hole_4`, `lip`, `slab`."""
+    d, hole, face = dimensions, *(replace(surface, friction=friction) for surface in (HOLE, SLAB))
+    contents = ""
+    for number, (x, y) in enumerate(d.peg_positions):
+        contents += collision(f"hole_{number}", at(x, y), mesh("grid_clamp_hole.obj"), hole)
+    contents += collision("lip", at(), mesh("grid_clamp_lip.obj"), LIP)
+    contents += visual("lip_visual", at(), mesh("grid_clamp_lip.obj"), STEEL)
+    slab = at(z=-d.table_thickness / 2)
+    contents += collision("slab", slab, box(d.table_width, d.table_width, d.table_thickness), face)
+    contents += visual("slab_visual", at(), mesh("grid_clamp_slab.obj"), ALUMINIUM)
+    return model("table", 1.0, (0.0, 0.0, -d.table_thickness / 2), 30.0 * MM, contents)
+
+
+def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[str, str]:
+    """Return the content of each file by name."""
+    return {
+        "grid_clamp_peg.obj": peg_mesh(dimensions).to_obj(),
+        "grid_clamp_bead.obj": bead_mesh(dimensions).to_obj(),
+        "grid_clamp_hole.obj": hole_mesh(dimensions).to_obj(),
+        "grid_clamp_lip.obj": lip_mesh(dimensions).to_obj(),
+        "grid_clamp_slab.obj": slab_mesh(dimensions).to_obj(),
+        CLAMP_SDF.name: clamp_sdf(dimensions, friction),
+        TABLE_SDF.name: table_sdf(dimensions, friction),
+    }
+
+
+def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
+    """Return the folder with the files of clamp and table: a temporary one, or this module's for default arguments."""
+    if (dimensions, friction) == (GridClampDimensions(), FRICTION):
+        return FOLDER
+    return generate_assets(files, dimensions, friction)
+
+
+# Each side of the bead has its own spring, as stiff as one side of Drake's compliant bead in the lip.
+BEAD_STIFFNESS = 7e3  # [N/m]
+BEAD_CORE = 2.0 * MM  # inner radius of the bead's sides
+BEAD_GAP = 0.4 * MM  # gap between a side and its corners: a side must touch only the side of the lip that it faces
+# Extra radius in the middle of a side's crest. A straight crest would touch along a line, with an arbitrary normal.
+BEAD_CROWN = 0.01 * MM
+LIP_BACK = 2.0 * MM  # radial thickness of the lip
+
+
+def clamp_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) -> list[Surface]:
+    """Return the collision geometry of the clamp in its frame C."""
+    d, peg = dimensions, Hull(peg_mesh(dimensions).vertices)
+    pegs = [
+        Surface(f"peg_{number}", f"hole_{number}", peg, friction, (x, y, 0.0))
+        for number, (x, y) in enumerate(d.peg_positions)
+    ]
+    crest = (0.0, 0.0, d.peg_length - d.bead_depth)
+    bead = [
+        Surface(f"bead_{number}", "lip", Hull(hull), BEAD.friction, crest, spring=Spring(axis, BEAD_STIFFNESS))
+        for number, (hull, axis) in enumerate(bead_hulls(d))
+    ]
+    body = Box(d.shoulder_width, d.shoulder_width, d.body_height)
+    return [*pegs, *bead, Surface("pad", "slab", body, friction, (0.0, 0.0, d.peg_length + d.body_height / 2))]
+
+
+def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) -> list[Surface]:
+    """Return the collision geometry of the table in its frame G."""
+    d = dimensions
+    holes = [
+        Surface(f"hole_{number}_{side}", f"hole_{number}", Hull(hull), friction, (x, y, 0.0))
+        for number, (x, y) in enumerate(d.peg_positions)
+        for side, hull in enumerate(hole_hulls(d))
+    ]
+    lip = [Surface(f"lip_{side}", "lip", Hull(hull), LIP.friction) for side, hull in enumerate(lip_hulls(d))]
+    slab = Box(d.table_width, d.table_width, d.table_thickness)
+    return [*holes, *lip, Surface("slab", "slab", slab, friction, (0.0, 0.0, -d.table_thickness / 2))]
+
+
+def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
+    """Return the vertices (V, 3) [m] of the convex pieces of a hole's wall, chamfer and face.
+
+    The pieces have the polygonal surface of `hole_mesh`.
+    """
+    d = dimensions
+    profile = [
+        [d.hole_radius + d.hole_chamfer, 0.0],
+        [d.face_radius, 0.0],
+        [d.face_radius, -d.hole_land],
+        [d.hole_radius, -d.hole_land],
+        [d.hole_radius, -d.hole_chamfer],
+    ]
+    return ring_hulls(np.array(profile), NUM_SIDES)
+
+
+def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
+    """Return the vertices (V, 3) [m] of the convex pieces of the lip, with the polygonal surface of `lip_mesh`."""
+    d = dimensions
+    top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
+    profile = [
+        [d.lip_radius + d.lip_flank, top + d.lip_flank],
+        [d.lip_radius + d.lip_flank + LIP_BACK, top + d.lip_flank],
+        [d.lip_radius + d.lip_flank + LIP_BACK, bottom - d.lip_flank],
+        [d.lip_radius + d.lip_flank, bottom - d.lip_flank],
+        [d.lip_radius, bottom],
+        [d.lip_radius, top],
+    ]
+    return ring_hulls(np.array(profile), NUM_SIDES)
+
+
+def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
+    """Return the vertices (V, 3) [m] of each side of the bead and its outward direction (3,).
+
+    Heights are relative to the crest. The sides have the polygonal surface of `bead_mesh`, with gaps at its corners and
+    a crown on its crest.
+    """
+    d = dimensions
+    radius, height = np.array(
+        [
+            [BEAD_CORE, d.bead_exit],
+            [d.peg_radius, d.bead_exit],
+            [d.bead_radius, 0.0],
+            [d.peg_radius, -d.bead_entry],
+            [BEAD_CORE, -d.bead_entry],
+        ]
+    ).T
+    half_width = radius * np.tan(np.pi / NUM_SIDES) - BEAD_GAP
+    sides = []
+    for middle in 2.0 * np.pi * (np.arange(NUM_SIDES) + 1) / NUM_SIDES:
+        outward, along = np.array([[np.cos(middle), np.sin(middle)], [-np.sin(middle), np.cos(middle)]])
+        ends = [np.outer(radius, outward) + sign * np.outer(half_width, along) for sign in (-1.0, 1.0)]
+        crown = np.append((d.bead_radius + BEAD_CROWN) * outward, 0.0)
+        vertices = np.concatenate([*(np.column_stack([end, height]) for end in ends), crown[None]])
+        sides.append((vertices, (float(outward[0]), float(outward[1]), 0.0)))
+    return sides

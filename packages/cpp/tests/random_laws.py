@@ -13,22 +13,24 @@ from safetensors.numpy import save
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, make_law
+from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
-from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, pose_to_transform, rpy_rotation, transform_to_pose
 from guiderail.models.control.wrench import WrenchBound, bounded_wrench, governed_error
+from guiderail.models.laws.law import Command, Law, safe_command
+from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.templates import load_template, parse_template
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
+from guiderail.systems.command_checks import CommandWatchdog, ConstraintViolation
+from guiderail.systems.wrench_limits import PhaseWrenchLimit
+from guiderail.tools.export import GUIDED, load_skill
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.export import governor_arrays, policy_arrays
-from guiderail_cpp.recording import double_action
+from guiderail_cpp.project import EXPORTED, governor_arrays, policy_arrays, skill_arrays
+from guiderail_cpp.recording import double_action, record_skill
 from guiderail_cpp.templates import template_arrays
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
 
@@ -42,37 +44,31 @@ def _files(data: Arrays, recording: Arrays, texts: dict[str, str] | None = None)
     return save(frozen(data), metadata=texts), save(frozen(recorded))
 
 
-def record_guidance(guidance, period, steps, rng, start, action, near, episode=EPISODE, outputs=()) -> Arrays:
-    """Simulate a guidance diagram with random actions and measured poses; the functions draw them."""
+def record_law(law: Law, steps, rng, start, action, near, episode=EPISODE, *, has_states=False) -> Arrays:
+    """Take control steps with random actions and measured poses; the functions draw them.
+
+    `record_skill` does the same with the diagram of an environment.
+    """
     columns: dict[str, list] = {name: [] for name in ("reset", "action", "pose", "command", "fallback", "violation")}
-    columns |= {name: [] for name in outputs}
-    ports = {name: guidance.GetInputPort(name) for name in ("action", "pose", "wrench")}
-    command = np.zeros(0)
+    columns |= {"state": []} if has_states else {}
     for step in range(steps):
         number = step % episode
         if number == 0:
-            simulator = Simulator(guidance, guidance.CreateDefaultContext())
-            context = simulator.get_mutable_context()
-            first = start(rng)
-            for name, port in ports.items():
-                port.FixValue(context, first if name == "pose" else np.zeros(port.size()))
-            simulator.Initialize()
-            pose = first
+            pose = start(rng)
+            state, command = law.start(pose), Command(pose)
         else:
-            pose = near(rng, command)
+            pose = near(rng, command.pose)
+            state = law.next(state, command, pose)
         taken = action(rng, number)
-        ports["action"].FixValue(context, taken)
-        ports["pose"].FixValue(context, pose)
-        simulator.AdvanceTo((number + 1) * period)
-        command = guidance.GetOutputPort("desired_pose").Eval(context)
+        command = safe_command(law.command(state, taken, pose, np.zeros(0)), command.pose)
         columns["reset"].append(float(number == 0))
         columns["action"].append(taken)
         columns["pose"].append(pose)
-        columns["command"].append(command)
-        columns["fallback"].append(guidance.GetOutputPort("fallback").Eval(context)[0])
-        columns["violation"].append(guidance.GetOutputPort("constraint_violation").Eval(context)[0])
-        for name in outputs:
-            columns[name].append(guidance.GetOutputPort(name).Eval(context)[0])
+        columns["command"].append(command.pose)
+        columns["fallback"].append(float(command.fallback))
+        columns["violation"].append(max(command.violation, ConstraintViolation.UNCONSTRAINED))
+        if has_states:
+            columns["state"].append(float(state.number))
     return columns
 
 
@@ -90,12 +86,11 @@ def held(scale: float, size: int, repeat: int = 5, limit: float = np.inf) -> Cal
 
 
 def _primitive(config: PrimitiveConfig, *, history: bool, scale: float, steps: int, pose_noise: float = 0.0) -> Files:
-    rng, outputs, period = np.random.default_rng(0), config.num_outputs, config.control_period
-    prior = PriorKnowledge(period, primitive=config, pose_size=outputs)
-    guidance, law = PrimitiveGuidance(prior, history=history), make_law(prior, history=history)
+    rng, outputs = np.random.default_rng(0), config.num_outputs
+    law = make_law(PriorKnowledge(config.control_period, primitive=config, pose_size=outputs), history=history)
     first = config.reference.means[0]
-    recording = record_guidance(
-        guidance, period, steps, rng,
+    recording = record_law(
+        law, steps, rng,
         start=lambda rng: first + 1e-3 * rng.normal(size=outputs),
         action=held(scale, config.num_actions),
         near=lambda rng, command: command + pose_noise * rng.normal(size=outputs),
@@ -153,13 +148,13 @@ def equal_bounds(steps: int) -> Files:
 def _template(template, frames, steps, start, *, velocity=False, period=0.01, limit=0.004, seed=0) -> Files:
     rng = np.random.default_rng(seed)
     mapping = load_template("end_effector_velocity") if velocity else None
-    guidance = SctGuidance(template, frames, period, input_mapping=mapping, max_tracking_error=limit)
-    recording = record_guidance(
-        guidance, period, steps, rng,
+    law = TemplateLaw(template, frames, period, input_mapping=mapping, max_tracking_error=limit)
+    recording = record_law(
+        law, steps, rng,
         start=lambda rng: _allowed_start(template, frames, start, rng),
         action=held(1.6, (mapping or template).inputs, 10, limit=1.0),
         near=lambda rng, command: command + 2e-3 * rng.normal(size=6),
-        outputs=("state",),
+        has_states=True,
     )  # fmt: skip
     data = template_arrays(template, frames)
     if mapping is not None:
@@ -413,7 +408,16 @@ def watchdog(steps: int) -> Files:
     return _files({"period": np.array([period]), "timeout": np.array([0.1])}, recording)
 
 
+def whole_skill(steps: int) -> Files:
+    """Observation, policy and guidance of the connector that comes with the package."""
+    skill = load_skill("pretrained:connector", GUIDED, EXPORTED)
+    data, texts, signals = skill_arrays(skill)
+    recording = record_skill(skill, signals, episodes=-(-steps // skill.num_steps))
+    return save(frozen(data), metadata=texts), save(frozen({name: rows[:steps] for name, rows in recording.items()}))
+
+
 LAWS: dict[str, Callable[[int], Files]] = {
+    "whole skill of the connector": whole_skill,
     "kgrl": kgrl,
     "kgrl, equal bounds": equal_bounds,
     "skgrl": skgrl,

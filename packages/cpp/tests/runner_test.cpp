@@ -1,7 +1,11 @@
 // Runs an exported skill with wrong and missing measurements: targets stay finite, slow and inside the force bound, and
 // nothing is allocated or thrown.
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
+#include <fstream>
+#include <iterator>
 #include <limits>
 #include <new>
 #include <random>
@@ -119,6 +123,59 @@ static int test_gap(const Data& data, const double* start) {
   return 0;
 }
 
+// A target beside a measured pose that the tool cannot have reached would move the tool: it is held.
+static int test_jump(const Data& data, const double* start) {
+  Runner runner(data, {});
+  const Measured measured = measured_at(start);
+  CHECK(runner.start(measured.pose));
+  double held[7];
+  for (int i = 0; i < 100; ++i) std::copy_n(runner.update(kPeriod, measured.pose, measured.wrench, 0.0), 7, held);
+  Measured moved = measured, turned = measured;
+  moved.pose[0] += 0.5;
+  turned.pose[3] = measured.pose[6], turned.pose[6] = -measured.pose[3];  // half a turn about x
+  turned.pose[4] = -measured.pose[5], turned.pose[5] = measured.pose[4];
+  for (const Measured& wrong : {moved, turned}) {
+    for (int i = 0; i < 500; ++i) CHECK(distance(runner.update(kPeriod, wrong.pose, wrong.wrench, 0.0), held) == 0.0);
+    CHECK(runner.state() == RunnerState::kStale);
+    CHECK(distance(runner.update(kPeriod, measured.pose, measured.wrench, 0.0), held) < 1e-3);
+    CHECK(runner.state() == RunnerState::kRunning);
+    std::copy_n(runner.update(kPeriod, measured.pose, measured.wrench, 0.0), 7, held);
+  }
+  return 0;
+}
+
+// Data whose arrays do not fit each other are refused when they are read.
+static int test_damaged(const char* path) {
+  std::ifstream file(path, std::ios::binary);
+  const std::string content((std::istreambuf_iterator<char>(file)), std::istreambuf_iterator<char>());
+  const std::string damaged_path = std::string(path) + ".damaged";
+  std::uint64_t header = 0;
+  std::memcpy(&header, content.data(), 8);
+  std::mt19937 random(0);
+  int refused = 0, accepted = 0;
+  for (int i = 0; i < 60; ++i) {
+    std::string damaged = content;
+    for (int changes = 1 + static_cast<int>(random() % 3); changes > 0; --changes) {
+      char& symbol = damaged[8 + random() % (header + (i % 2 ? 0 : 4000))];
+      symbol = symbol >= '0' && symbol <= '9' ? static_cast<char>('0' + random() % 10) : static_cast<char>(random());
+    }
+    if (i % 10 == 0) damaged.resize(random() % damaged.size());
+    std::ofstream(damaged_path, std::ios::binary).write(damaged.data(), static_cast<std::streamsize>(damaged.size()));
+    try {
+      Skill skill{Data(damaged_path)};
+      const std::vector<double> pose(static_cast<std::size_t>(skill.outputs()), 0.0);
+      skill.start(pose.data());
+      for (int step = 0; step < 20; ++step) skill.step(pose.data());
+      ++accepted;
+    } catch (const std::exception&) {
+      ++refused;
+    }
+  }
+  std::remove(damaged_path.c_str());
+  CHECK(refused > 15 && accepted > 0);
+  return 0;
+}
+
 // Random measurements, many of them impossible.
 static int test_garbage(const Data& data, const double* start) {
   std::mt19937 random(0);
@@ -157,8 +214,11 @@ static int test_garbage(const Data& data, const double* start) {
   return 0;
 }
 
-int main(int, char** argv) {
+// runner_test DATA RECORDING, or runner_test DATA to damage only the data.
+int main(int argc, char** argv) {
+  if (argc == 2) return test_damaged(argv[1]);
   const Data data(argv[1]), recording(argv[2]);
   const double* start = recording.get("replay/pose").data();
-  return test_settings(data) || test_limits(data, start) || test_gap(data, start) || test_garbage(data, start);
+  return test_settings(data) || test_limits(data, start) || test_gap(data, start) || test_jump(data, start) || test_garbage(data, start) ||
+         test_damaged(argv[1]);
 }

@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail_cpp.arrays import primitive_arrays
-from guiderail_cpp.export import export_cpp
+from guiderail_cpp.project import export_cpp
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
 HERE = Path(__file__).parent
@@ -52,6 +52,17 @@ def test_runner_survives_wrong_measurements_and_keeps_its_limits(tmp_path):
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
     command = [tmp_path / "runner_test", folder / "skill.safetensors", folder / "test/recording.safetensors"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@needs_compiler
+def test_damaged_template_is_refused_when_it_is_read(tmp_path):
+    folder = tmp_path / "skill"
+    export_cpp("pretrained:pouring", folder)
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
+    command = [tmp_path / "runner_test", folder / "skill.safetensors"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
 

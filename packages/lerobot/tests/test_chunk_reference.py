@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import LcNsKmpSystem
 from guiderail.systems.policy_system import PolicyError
 from guiderail_lerobot.chunk_reference import ChunkReference
 
@@ -138,8 +138,6 @@ def test_window_is_refused_when_it_does_not_fit_the_primitive():
         window = np.zeros((5, 2)), np.tile(covariance, (5, 1, 1))
         with pytest.raises(InputError, match="positive definite"):
             primitive.predict_window(0, *window)
-        with pytest.raises(InputError, match="positive definite"):
-            primitive.predict_at(0.1 * np.arange(5), *window)
 
 
 @pytest.mark.parametrize("history", [0, 3])

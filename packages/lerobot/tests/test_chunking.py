@@ -10,8 +10,7 @@ from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.learning.train import train
 from guiderail_lerobot.base_policy import chunk_samples, find_base_policy
 from guiderail_lerobot.chunking import ChunkLearner
-from guiderail_lerobot.config import ChunkConfig, DistillationConfig
-from guiderail_lerobot.distillation import DistillationLearner
+from guiderail_lerobot.config import ChunkConfig
 
 SETTINGS = {"demonstration_episodes": 4, "gradient_steps": 400, "members": 3, "chunk_steps": 4, "net_arch": (16,)}
 SETTINGS |= {"learning_rate": 1e-2, "observation_noise": 0.01}
@@ -60,20 +59,6 @@ def test_state_before_the_first_demonstration_is_restored():
     arrays, values = after.state()
     assert {name: len(array) for name, array in arrays.items()} == {"observations": 0, "actions": 0, "groups": 0}
     assert values["episodes"] == 0
-
-
-@pytest.mark.parametrize(
-    ("learner", "config", "message"),
-    [
-        (ChunkLearner, ChunkConfig(pipelined=True), "^chunk needs .* in this process: leave pipelined out$"),
-        (ChunkLearner, ChunkConfig(num_envs=2), "^chunk needs .* in this process: leave num_envs out$"),
-        (DistillationLearner, DistillationConfig(num_envs=2), "^distillation needs .*: leave num_envs out$"),
-    ],
-)
-def test_learner_refuses_simulation_in_another_process(learner, config, message):
-    env = make_environment("NarrowPassage", {"guidance": "kgrl"})
-    with pytest.raises(InputError, match=message):
-        learner(config, env, action_repeat=1, seed=0, max_transitions=10)
 
 
 def test_learner_refuses_an_environment_without_a_diagram():

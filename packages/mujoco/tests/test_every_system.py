@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_mujoco import gantry
 from guiderail_mujoco.station import MujocoStation
 from oracles.systems import check_source, check_system, system_names

@@ -7,8 +7,8 @@ from pydrake.systems.analysis import Simulator
 pytest.importorskip("mujoco")
 
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail_mujoco.gantry import MovedBodies, MujocoGantry

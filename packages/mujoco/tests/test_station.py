@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform
 from guiderail import InputError, make_env
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 

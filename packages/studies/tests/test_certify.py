@@ -7,7 +7,7 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
+from guiderail.diagrams.tasks.narrow_passage import NarrowPassage, reference_trajectory
 from guiderail.models.common.errors import InputError
 from guiderail_studies.certificate.adversary import Adversary
 from guiderail_studies.certify import _declared_start, _find_subject, certify_skill, verify_certificate

@@ -27,6 +27,7 @@ from guiderail_studies.study import (
     differences_by_method,
     draw_sweeps,
     each,
+    method_rows,
     ratio,
     run_study,
     study_command,
@@ -369,6 +370,29 @@ def test_process_engine_returns_the_rows_of_a_single_process(tmp_path):
     pd.testing.assert_frame_equal(*(table.drop(columns="folder") for table in tables))
 
 
+def test_method_row_has_mean_and_range_over_seeds():
+    rows = pd.DataFrame(
+        {
+            "method": ["a", "a", "b"],
+            "after_episodes": [60, 60, 0],
+            "eval_set": "held out",
+            "episodes": 100,
+            "success_rate": [0.5, 1.0, 0.25],
+            "mean_return": [1.0, 3.0, 2.0],
+            "peak_force": [10.0, 12.0, np.nan],
+            "violating_episodes": [1, 2, 0],
+            "training_episodes_to_convergence": [20, None, None],
+        }
+    )
+    learned, baseline = method_rows(rows)
+    assert learned["success [%]"] == "75 (50–100)"
+    assert (learned["largest force [N]"], learned["episodes with a violation"]) == ("12", "3")
+    assert learned["episodes to convergence"] == "20, 1 never"
+    assert (baseline["success [%]"], baseline["seeds"]) == ("25", 1)
+    assert (baseline["largest force [N]"], baseline["episodes to convergence"]) == ("–", "–")
+    assert baseline["success in training [%]"] == "–"  # the rows have no such column
+
+
 def test_study_command_summarizes_each_seed(tmp_path, capsys):
     study = make_study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
     result = study_command(study, tmp_path, make_engine(processes=1), file=Path("first.yaml"))
@@ -381,6 +405,9 @@ def test_study_command_summarizes_each_seed(tmp_path, capsys):
     assert result["learner after 2 episodes, held out, success of each seed"] == rates
     assert result["mean return of learner as a fraction of learner's, each seed"] == "1.00, 1.00"
     assert "differences" not in result
+    header, _, row = (tmp_path / "beads.md").read_text().splitlines()  # one method, with two seeds
+    assert header.count("|") == 13
+    assert row.startswith("| learner | 2 | 2 | held out | 3 |")
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err
     assert "2/2 learner, seed 6: held out" in err
@@ -419,7 +446,7 @@ def test_ratio_lists_each_seed_once_with_several_evaluation_sets():
 
 def test_statistics_of_an_imported_task_are_computed(tmp_path):
     (tmp_path / "passage_of_lab.py").write_text(
-        "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n"
+        "from guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n"
         "from guiderail.diagrams.tasks.registry import register_task\n"
         "from guiderail.tools.evaluation.metrics import Metric\n\n\n"
         "@register_task('lab/Passage')\n"

@@ -6,7 +6,7 @@ import pytest
 
 from guiderail import make_env
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.make import make_prior_knowledge, make_skill
+from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import (
@@ -14,13 +14,12 @@ from guiderail.diagrams.stations.station import (
     PLANT_PERIOD,
     command_timeout,
     tare_steps,
-    whole_multiple,
 )
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 
 
@@ -69,17 +68,6 @@ def test_control_period_is_refused_when_out_of_range(task, options, message):
 
 def test_period_is_accepted_when_a_multiple_of_the_plants():
     assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).diagram.control_period == 3 * PLANT_PERIOD
-
-
-def test_hardware_period_is_a_multiple_of_the_drivers():
-    skill = make_skill(
-        "GridClamp", lambda observation: observation, station="hardware", robot_url="memq://", control_period=0.1
-    )
-    station = skill.diagram.GetSubsystemByName("station")
-    assert skill.control_period == station.control_period == 20 * station.period
-    assert station.clone(configure("GridClamp").declared.workcell()).control_period == station.control_period
-    with pytest.raises(InputError, match=r"whole multiple of 0\.005 s"):
-        whole_multiple(0.0125, station.period)
 
 
 @pytest.mark.parametrize("milliseconds", [0.5, 1.0, 2.0, 2.5, 4.0, 20 / 3])
@@ -160,11 +148,3 @@ def test_timeout_and_tare_follow_the_period():
     assert (command_timeout(0.02), command_timeout(0.05), command_timeout(0.1)) == (0.1, 0.1, 0.2)
     assert tare_steps(CONTROL_PERIOD) == (3, 5)
     assert tare_steps(5 * CONTROL_PERIOD) == (1, 1)
-
-
-@pytest.mark.parametrize(("period", "time_scale"), [(0.0, 1.0), (np.nan, 1.0), (0.1, -1.0), (2.0, 1.0)])
-def test_resampling_raises_when_no_motion_remains(period, time_scale):
-    reference = ReferenceTrajectory(0.1 * np.arange(20), np.zeros((20, 1)), np.ones((20, 1, 1)))
-    assert reference.resampled(1.0).num_steps == 2
-    with pytest.raises(InputError):
-        reference.resampled(period, time_scale)

@@ -104,8 +104,6 @@ def test_state_is_refused_when_it_does_not_fit():
     other.reset(seed=0)
     with pytest.raises(InputError, match="another diagram: save it in this one"):
         env.restore(other.save())
-    with pytest.raises(InputError, match="what save\\(\\) returned, not from 3"):
-        env.restore(3)
     state = env.save()
     env.close()
     for call in (env.save, lambda: env.restore(state)):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.envs.scene import Camera, add_camera, look_at
-from guiderail.models.common.errors import InputError
 
 SCRIPT = """
 import gymnasium, guiderail
@@ -22,22 +22,10 @@ env.step(env.action_space.sample())
 """
 
 
-@pytest.mark.parametrize("target", [[0.5, 0.0, 0.0], [0.5, 0.0, 2.0], [0.5, 0.0, 1.0], [np.nan, 0.0, 0.0]])
-def test_look_at_is_refused_without_a_level_horizon(target):
-    with pytest.raises(InputError, match="level horizon"):
-        look_at(np.array([0.5, 0.0, 1.0]), np.array(target))
-
-
 def test_project_returns_pixels_when_camera_is_fixed():
     camera = Camera((40, 20), np.deg2rad(90.0), look_at(np.zeros(3), np.array([1.0, 0.0, 0.0])))
     points = [[2.0, 0.0, 0.0], [2.0, 1.0, 0.0], [2.0, 0.0, 1.0]]
     np.testing.assert_allclose(camera.project(points), [[20.0, 10.0], [15.0, 10.0], [20.0, 5.0]])
-
-
-def test_project_is_refused_when_camera_moves_with_a_frame():
-    camera = Camera((40, 20), np.deg2rad(90.0), RigidTransform(), frame="wrist")
-    with pytest.raises(InputError, match=r"'wrist'.*fixed in the world"):
-        camera.project(np.ones((1, 3)))
 
 
 def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
@@ -47,7 +35,9 @@ def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
     builder, scene_graph = DiagramBuilder(), SceneGraph()
     builder.AddSystem(scene_graph)
     camera = Camera((8, 8), 1.0, RigidTransform())
-    add_camera(builder, scene_graph, scene_graph.get_query_output_port(), "camera", camera)
+    query = scene_graph.get_query_output_port()
+    ports = {"HasOutputPort": lambda name: True, "GetOutputPort": lambda name: query}
+    add_camera(builder, SimpleNamespace(scene_graph=scene_graph, **ports), "camera", camera)
     assert sys.modules.pop("triton").__file__ == str(tmp_path / "triton.py")
 
 

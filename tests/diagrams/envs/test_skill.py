@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import PassThrough
 
 from guiderail.diagrams.envs.make import make_env, make_skill
-from guiderail.models.common.errors import InputError
 
 CASES = {
     "NarrowPassage": {"guidance": "skgrl", "action_repeat": 5},
@@ -63,31 +60,3 @@ def test_policy_receives_the_image_of_the_camera():
     skill.randomize(simulator.get_mutable_context(), np.random.default_rng(0), {})
     simulator.AdvanceTo(0.05)
     assert shapes == [(110, 144, 3)]
-
-
-def test_policy_diagram_is_refused_when_port_sizes_differ():
-    builder = DiagramBuilder()
-    system = builder.AddSystem(PassThrough(3))
-    builder.ExportInput(system.get_input_port(), "observation")
-    builder.ExportOutput(system.get_output_port(), "action")
-    with pytest.raises(InputError, match="an observation of size 1 and an action of size 2, not 3 and 3"):
-        make_skill("NarrowPassage", builder.Build(), guidance="kgrl")
-
-
-def test_policy_is_refused_when_its_ports_are_unknown():
-    message = "needs an input 'observation' and an output 'action', unlike PassThrough"
-    with pytest.raises(InputError, match=message):
-        make_skill("NarrowPassage", PassThrough(3), guidance="kgrl")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"render_mode": "ascii"}, "no render mode 'ascii'"),
-        ({"render_mode": "human", "station": "hardware", "robot_url": "memq://"}, "no scene to draw"),
-        ({"render_mode": "rgb_array", "station": "hardware", "robot_url": "memq://"}, "no scene to draw"),
-    ],
-)
-def test_skill_refuses_a_render_mode_that_is_not_available(options, message):
-    with pytest.raises(InputError, match=message):
-        make_skill("GridClamp", policy(3), **options)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.trace import EpisodeTrace, mean_jerk
-from guiderail.models.common.errors import InputError
 
 SIGNALS = {"commanded_violation": 1, "measured_violation": 1, "collision": 1, "saturation": 2, "fallback": 1}
 NO_VIOLATION = {"commanded_violation": -1.0, "measured_violation": -1.0}
@@ -66,13 +65,6 @@ def test_clear_deletes_every_control_step():
     assert empty.pop("max_commanded_violation") == empty.pop("max_measured_violation") == -np.inf
     assert set(empty.values()) == {0.0}
     assert len(trace) == len(trace.force) == 0
-
-
-def test_append_names_a_missing_signal():
-    trace = EpisodeTrace(2, 2, 0.1, SIGNALS)
-    with pytest.raises(InputError, match="lacks the signal 'collision'"):
-        trace.append(np.zeros(2), np.zeros(2), 0.0, 0.0, {name: 0.0 for name in SIGNALS if name != "collision"})
-    assert len(trace) == 0
 
 
 def test_mean_jerk_is_exact_for_a_cubic():

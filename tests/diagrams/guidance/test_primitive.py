@@ -4,17 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.envs.options import PrimitiveOptions
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
-from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
+from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import StateProgress
@@ -203,61 +199,10 @@ def test_primitive_is_evaluated_once_a_control_step(skill):
         assert len(calls) == 10, kind
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("unknown", "there is no guidance 'unknown': .*kgrl, .*kmp, none, residual, .*safe_residual, sct, skgrl"),
-        ("kgrll", "did you mean kgrl"),
-        (
-            "sct",
-            "'sct' needs a shared control template.*use base_policy, kgrl, .*kmp, residual, .*skgrl",
-        ),
-        ("none", "'none' needs .*kmp"),
-    ],
-)
-def test_guidance_is_refused_with_alternatives(skill, kind, message):
-    with pytest.raises(InputError, match=message):
-        build(kind, skill)
-
-
-def test_safe_residual_is_refused_without_walls(skill):
-    with pytest.raises(
-        InputError,
-        match=r"walls to keep out of, .*BncConnector.*kmp, residual, residual_base_policy, residual_covariance, skgrl",
-    ):
-        build("safe_residual", replace(skill, keep_out=None), "BncConnector")
-    assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"action_dims": ()},
-        {"action_dims": (2,)},
-        {"action_dims": (0, 0)},
-    ],
-)
-def test_primitive_config_is_refused_when_invalid(skill, change):
-    with pytest.raises(InputError):
-        replace(skill, **change)
-
-
-def test_gains_are_refused_when_their_number_is_wrong(skill):
-    with pytest.raises(InputError, match="one per output"):
-        build("kgrl", replace(skill, gains=(1.0, 2.0, 3.0)))
-
-
-@pytest.mark.parametrize("option", ["horizon", "history"])
-def test_horizon_and_history_are_at_most_200_steps(option):
-    assert getattr(PrimitiveOptions(**{option: 200}), option) == 200
-    with pytest.raises(ValidationError, match="less than or equal to 200"):
-        PrimitiveOptions(**{option: 201})
-
-
 @pytest.mark.parametrize("kind", ["kmp", "kgrl", "skgrl"])
 def test_motion_constraints_bound_the_primitives_commands(skill, kind):
     disc = Sphere(skill.reference.means[30], 0.03)
-    motion = MotionConstraints(skill.constraints, [disc], (), [0.3, 0.3], [3.0, 3.0])
+    motion = MotionConstraints(skill.constraints, [disc], [0.3, 0.3], [3.0, 3.0])
     guidance = build(kind, replace(skill, motion=motion))
     rng = np.random.default_rng(0)
     commands, _ = rollout(guidance, np.repeat(rng.uniform(-1, 1, (STEPS // 5, 2)), 5, axis=0))
@@ -292,34 +237,6 @@ def test_motion_waits_when_the_robot_does_not_follow(skill, kind):
         np.testing.assert_array_equal(delayed[first : first + 20], np.tile(delayed[first], (20, 1)))
         np.testing.assert_array_equal(delayed[first + 20 :], free[first:-20])
     assert np.linalg.norm(delayed[first + 19]) < 0.5 * np.linalg.norm(free[first + 19])
-
-
-def test_residual_is_refused_when_the_motion_waits(skill):
-    with pytest.raises(InputError, match="clock"):
-        build("residual", replace(skill, progress=StateProgress((0.02, 0.1), 20)))
-
-
-def test_waiting_motion_is_refused_with_constraints_by_step(skill):
-    moving = LinearConstraints.box(np.full((STEPS, 2), -1.0), np.full((STEPS, 2), 1.0))
-    with pytest.raises(InputError, match="progress=clock"):
-        replace(skill, constraints=moving, progress=StateProgress((0.02, 0.1), 20))
-
-
-LIMITS = {"max_speed": (0.5,), "max_acceleration": (4.0,)}
-
-
-@pytest.mark.parametrize("guidance", ["residual", "safe_residual", "residual_covariance"])
-@pytest.mark.parametrize("name", LIMITS)
-def test_guidance_without_constraints_refuses_motion_limits(guidance, name):
-    with pytest.raises(InputError, match=f"only kgrl, skgrl and kmp enforce {name}: choose"):
-        make_env("NarrowPassage", guidance=guidance, **{name: LIMITS[name]})
-
-
-def test_speed_limit_may_be_a_single_number():
-    speeds = [EnvConfig.resolve("NarrowPassage", {"max_speed": value}).options["max_speed"] for value in (0.5, "0.5")]
-    assert speeds == [(0.5,), (0.5,)]
-    with pytest.raises(InputError, match="max_speed must be several numbers, such as"):
-        EnvConfig.resolve("NarrowPassage", {"max_speed": True})
 
 
 def test_limits_are_expanded_to_all_outputs():

@@ -8,7 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.prior import PlacedTemplate, PriorKnowledge
+from guiderail.diagrams.guidance.prior import PlacedTemplate
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
@@ -172,5 +172,3 @@ def test_filter_stops_at_the_mug_when_a_pose_is_requested(template):
 def test_prior_knowledge_refuses_invalid_templates():
     with pytest.raises(InputError, match="a template is a SharedControlTemplate"):
         PlacedTemplate("grid_clamp.yaml", {"hole": RigidTransform()})
-    with pytest.raises(InputError, match="a task's template is a PlacedTemplate"):
-        PriorKnowledge(0.02, template=load_template("grid_clamp"))

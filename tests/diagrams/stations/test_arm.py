@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import MID_TURN_POSE, ArmControllerPlant, ArmStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock

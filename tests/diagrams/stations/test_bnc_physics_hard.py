@@ -8,8 +8,8 @@ from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.common.transforms import MM
+from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 
 HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 WORKCELL = HARD.workcell()

@@ -9,8 +9,8 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.stations.continuous_station import ContinuousStation
-from guiderail.diagrams.tasks.bnc_connector.task import BncConnector, BncWorkcell
+from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
+from guiderail.diagrams.tasks.bnc_connector import BncConnector, BncWorkcell
 from guiderail.models.primitives import ReferenceTrajectory
 
 HEIGHT = 0.06  # height above the socket [m]

@@ -148,21 +148,6 @@ def test_payload_is_added_to_the_tool_mass_of_an_arm():
     assert tool.get_mass(arm.plant.CreateDefaultContext()) == pytest.approx(tool.default_mass())
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"disturbances.payload": 0.5}, "station=arm"),
-        ({"disturbances.clock_factor": 0.6}, "whole multiple"),
-        ({"disturbances.friction_factor": (2.0, 1.0)}, "smaller one first"),
-        ({"sensing.wrench_bias": (-1.0, 0.0)}, "none negative"),
-        ({"disturbances.lost_commands": 1.0}, "less than 1"),
-    ],
-)
-def test_environment_raises_when_a_disturbance_is_invalid(options, message):
-    with pytest.raises(InputError, match=message):
-        make_env("GridClamp", **options)
-
-
 def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 

@@ -8,7 +8,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations import gantry
 from guiderail.diagrams.stations.gantry import GantryStation, max_stable_time_step
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, INPUTS, PLANT_PERIOD, Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from research.benchmarks.impedance import step_response
 

@@ -8,7 +8,7 @@ from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.transforms import MM
 
 WORKCELL = GridClampWorkcell()

@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 
 WORLD, CONFIG = PassageGeometry(), PlaneConfig()
 

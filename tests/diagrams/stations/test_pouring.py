@@ -1,11 +1,9 @@
 """Pouring station with an arm of six joints."""
 
 import numpy as np
-import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.pouring import MID_POURING_POSE, PouringConfig, PouringStation
-from guiderail.models.common.errors import InputError
 
 UPRIGHT = np.array([-0.15, -0.20, 0.15, 0.0, 0.0, 0.0])
 TILTED = MID_POURING_POSE + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]
@@ -32,8 +30,3 @@ def test_six_joint_arm_tilts_the_thermos_over_the_mug():
     assert max(errors) < 0.008  # tracking error of the position [m]
     np.testing.assert_allclose(pose.Eval(context), TILTED, atol=2e-3)
     assert balls.Eval(context)[2] > 0.0  # a ball has left the thermos through the tip
-
-
-def test_config_raises_when_the_arm_has_no_drives():
-    with pytest.raises(InputError, match="'panda' can't pour: its data have no drives or no level posture"):
-        PouringStation(PouringConfig(robot="panda"))

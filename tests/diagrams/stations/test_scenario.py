@@ -75,8 +75,3 @@ def test_wrong_file_is_refused(tmp_path, old, new, message):
     file.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=message):
         load_station(file)
-
-
-def test_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="scenario"):
-        load_station(tmp_path / "none.yaml")

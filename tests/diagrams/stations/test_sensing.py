@@ -140,17 +140,3 @@ def test_hardware_station_is_tared_and_adds_no_errors(sensing, is_tared):
 def test_exact_setting_adds_no_disturbances():
     env = make_env("BncConnector", sensing="exact", **HARD)
     assert not isinstance(env.diagram.diagram.GetSubsystemByName("station"), DisturbedStation)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sensing": "perfect"}, "there is no sensing 'perfect'"),
-        ({"sensing.calibration_error": (0.5, 0.0)}, "meters"),
-        ({"sensing.wrench_drift": (-1.0, 0.0)}, "none negative"),
-        ({"sensing": "robot", "sensing.wrench_bias": (1.0,)}, "sensing.wrench_bias"),
-    ],
-)
-def test_environment_raises_when_a_setting_is_invalid(options, message):
-    with pytest.raises(InputError, match=message):
-        make_env("BncConnector", **options)

@@ -3,9 +3,9 @@
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.continuous_station import TransformStation
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.stations.wrapped_stations import TransformStation
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
 START, GOAL = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]), np.array([0.01, 0.0, 0.04, 0.2, 0.1, -0.1])

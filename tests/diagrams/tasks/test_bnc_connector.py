@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
-from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks.bnc_connector import (
+    ALIGNMENT,
     NUM_STEPS,
+    BncUncertainty,
     reference_trajectory,
     scripted_torque_search,
 )
@@ -128,18 +129,6 @@ def test_contact_on_the_rim_is_invariant_under_a_half_turn(kmp, observe_on_rim):
     np.testing.assert_allclose(direct[~is_reversed], turned[~is_reversed], atol=0.1)
 
 
-def test_episode_repeats_when_the_seed_is_equal(kgrl):
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (12, 2))
-    episodes = []
-    for _ in range(2):
-        observation, info = kgrl.reset(seed=11)
-        observations = [observation] + [kgrl.step(action)[0] for action in actions]
-        episodes.append((np.array(observations), info["jack_offset"]))
-    for first, second in zip(*episodes, strict=True):
-        np.testing.assert_array_equal(first, second)
-
-
 def test_episode_ends_by_collision_when_force_is_not_bounded():
     """A residual commands the plug 24 mm down onto the rim of the jack, and neither pose nor force is bounded."""
     env = make_env(
@@ -226,15 +215,6 @@ def test_torque_search_locks_on_the_arm():
     assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[0]["is_success"]
 
 
-def test_push_displaces_the_robot(kgrl):
-    kgrl.reset(seed=0)
-    kgrl.step(np.zeros(2))
-    before = kgrl.trace.measured[-1].copy()
-    kgrl.push(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
-    kgrl.step(np.zeros(2))
-    assert kgrl.trace.measured[kgrl.action_repeat, 2] > before[2] + 0.001
-
-
 class TestUncertainty:
     def test_per_run_jack_offset_is_constant_during_a_run(self):
         fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
@@ -281,22 +261,6 @@ class TestUncertainty:
     def test_reset_option_is_refused_when_invalid(self, kmp, options):
         with pytest.raises(InputError):
             kmp.reset(options=options)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"guidance": "sct"},
-        {"reward": "dense"},
-        {"observation": "depth"},
-        {"fixture_offset": "known"},
-        {"station": "hardware"},
-        {"action_dims": (0, 6)},
-    ],
-)
-def test_option_is_refused_when_invalid(wrong):
-    with pytest.raises(InputError):
-        make_env("BncConnector", **wrong)
 
 
 def test_contact_on_the_rim_is_similar_after_a_quarter_turn(kmp, observe_on_rim):

@@ -108,12 +108,6 @@ def test_symmetry_leaves_the_observed_force_limit_unchanged():
             np.testing.assert_array_equal(matrix[:, -1], np.eye(size)[-1])
 
 
-@pytest.mark.parametrize("limits", [(25.0, 8.0), (0.5, 8.0), (8.0, 61.0)])
-def test_force_limit_range_is_refused_when_invalid(limits):
-    with pytest.raises(InputError, match="two forces from 1 to 60 N"):
-        EnvConfig.resolve("GridClamp", {"force_limit_range": limits})
-
-
 def test_station_is_refused_without_an_impedance():
     def build():
         raise AssertionError("must not be built")

@@ -8,7 +8,7 @@ from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, ContactProbe, drag, probe_contact
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector import sdf
+from guiderail.models.objects import bnc_connector
 
 CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
@@ -27,7 +27,7 @@ def test_contact_of_the_connector_has_converged_at_the_default_step(probes):
     assert probe_contact(CONNECTOR).drags == default.drags
     for probe in probes:
         assert probe.has_converged
-        assert probe.friction == sdf.FRICTION
+        assert probe.friction == bnc_connector.FRICTION
         assert probe.capture == pytest.approx(size.bore_clearance + size.mouth_chamfer, rel=0.5)
     for probe in finer:
         assert probe.drags == pytest.approx(default.drags, rel=MAX_DRAG_ERROR)

@@ -13,9 +13,9 @@ import guiderail
 from guiderail.diagrams.envs import scene
 from guiderail.diagrams.envs.config import prior_of
 from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage
+from guiderail.diagrams.tasks.narrow_passage import NarrowPassage
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 
 WORLD = PassageGeometry()
 GUIDANCE = possible_guidance(prior_of(NarrowPassage).provides)
@@ -76,25 +76,6 @@ def test_environment_with_images_passes_the_checkers(monkeypatch):
         gymnasium_check(env)
         sb3_check(env, warn=True)
     assert not [str(warning.message) for warning in warned]
-
-
-@pytest.mark.parametrize("guidance", GUIDANCE)
-def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(guidance):
-    rng = np.random.default_rng(1)
-    actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
-
-    def episode(env):
-        rewards, observations, _ = play(env, lambda k: actions[k], seed=5)
-        return rewards, observations, env.trace.measured.copy(), env.trace.force.copy(), env.trace.statistics()
-
-    used = make(guidance)
-    used.reset(seed=9)
-    for action in actions[:20]:
-        used.step(-action)
-    used.reset()
-    used.step(actions[0])
-    for first, second in zip(episode(make(guidance)), episode(used), strict=True):
-        np.testing.assert_equal(first, second)
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
@@ -263,21 +244,6 @@ def test_reset_option_start_sets_the_start():
             env.reset(options=options)
 
 
-def test_nan_in_the_plant_truncates_the_episode():
-    env = make("kmp")
-    env.reset()
-    observation, *_ = env.step(zero_action(0))
-    plant = env.diagram.diagram.GetSubsystemByName("station").plant
-    state = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context()).get_mutable_discrete_state_vector()
-    state.SetAtIndex(0, np.nan)
-    last, _, terminated, truncated, info = env.step(zero_action(0))
-    assert (terminated, truncated) == (False, True)
-    assert info["simulation_failure"]
-    np.testing.assert_array_equal(last, observation)
-    _, _, infos = play(env, zero_action)
-    assert infos[-1]["is_success"]
-
-
 def test_memory_does_not_grow_with_resets(forks, tmp_path):
     # A separate process, because memory of other tests would be part of the measurement.
     script = """
@@ -316,31 +282,6 @@ def test_image_shows_the_motion_of_the_robot():
     assert np.ptp(columns) > 10
 
 
-def test_render_returns_a_picture_of_the_plane():
-    env = make("kmp", render_mode="rgb_array")
-    env.reset()
-    picture = env.render()
-    assert (picture.shape, picture.dtype) == ((640, 480, 3), np.uint8)
-    assert picture.std() > 10
-
-
-def test_browser_view_is_refused_when_network_is_forbidden(monkeypatch):
-    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "none")
-    with pytest.raises(InputError, match="DRAKE_ALLOW_NETWORK=meshcat"):
-        make("kmp", render_mode="human")
-
-
-def test_browser_view_has_a_local_address(monkeypatch):
-    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")
-    monkeypatch.setattr("guiderail.diagrams.envs.env.Simulator.set_target_realtime_rate", lambda *_: None)
-    env = make("kmp", render_mode="human")
-    assert "localhost" in env.diagram.meshcat.web_url()
-    env.reset()
-    env.step(zero_action(0))
-    env.render()
-    assert env.diagram.meshcat.HasPath("/drake/visualizer/robot/ball")
-
-
 def test_missing_display_library_is_named(monkeypatch):
     load = scene.ctypes.CDLL
 
@@ -356,35 +297,6 @@ def test_missing_display_library_is_named(monkeypatch):
     make("kmp")  # without a camera
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            {"guidance": "sct"},
-            "a shared control template.*use base_policy, kgrl, .*kmp, residual, .*residual_cbf",
-        ),
-        ({"guidance": "none"}, "use base_policy, kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
-        ({"guidance": "unknown"}, "there is no guidance 'unknown'"),
-        ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
-        ({"observation": "sound"}, "choose one of image, state"),
-        ({"stetion": "plane"}, "no option 'stetion' here: did you mean station"),
-        ({"station": "gantry"}, "no station 'gantry'.*plane"),
-        ({"difficulty": "extreme"}, "no difficulty 'extreme'"),
-        ({"render_mode": "ascii"}, "render mode"),
-        ({"action_repeat": 0}, "action_repeat"),
-        ({"action_scale": -1.0}, "action_scale"),
-        ({"history": 0}, "history"),
-        ({"history.variance": 0.0}, "history.variance"),
-        ({"history.source": "planned"}, "no history.source 'planned': choose one of commanded, measured"),
-        ({"gains": (1.0,)}, "one per output"),
-    ],
-)
-def test_option_is_refused_in_one_sentence_when_invalid(arguments, message):
-    with pytest.raises(InputError, match=message) as error:
-        make(**arguments)
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize("guidance", NULL_SPACE)
 def test_commands_avoid_an_obstacle_that_is_a_constraint(guidance):
     options = {"obstacle_radius": 0.06, "max_speed": (0.5,), "max_acceleration": (4.0,)}
@@ -397,32 +309,6 @@ def test_commands_avoid_an_obstacle_that_is_a_constraint(guidance):
     assert max(info["constraint_violation"] for info in infos[1:]) <= 1e-9
     displacements = np.diff(commands, axis=0) / env.diagram.control_period
     assert np.abs(displacements).max() <= 0.5 * (1 + 1e-9)
-
-
-def test_unconstrained_guidance_reports_obstacle_violation():
-    env = make("residual_covariance", obstacles_constrain=True, obstacle_radius=0.06, action_repeat=1)
-    env.reset(seed=0)
-    guidance, worst = env.diagram.diagram.GetSubsystemByName("guidance"), -np.inf
-    done = False
-    while not done:
-        *_, terminated, truncated, _ = env.step(np.array([0.5, 0.0]))
-        done = terminated or truncated
-        context = guidance.GetMyContextFromRoot(env.simulator.get_context())
-        worst = max(worst, guidance.GetOutputPort("constraint_violation").Eval(context)[0])
-    assert worst > 0.0
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"obstacles_constrain": True, "difficulty": "hard"}, "single fixed obstacle"),
-        ({"max_speed": (0.1, 0.0)}, "positive"),
-        ({"max_acceleration": (0.1, 0.1, 0.1)}, "2 outputs"),
-    ],
-)
-def test_motion_constraints_are_refused_when_invalid(options, match):
-    with pytest.raises(InputError, match=match):
-        make(**options)
 
 
 def test_observed_phase_stops_while_the_motion_waits():

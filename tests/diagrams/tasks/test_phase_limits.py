@@ -6,14 +6,11 @@ from itertools import count
 import gymnasium
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.diagrams.stations.impedance_control import WRENCH_RATE, make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Impedance, max_wrench
-from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
+from guiderail.diagrams.tasks.grid_clamp import GridClamp
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.templates import Transition, load_template
@@ -141,34 +138,3 @@ def test_state_does_not_raise_the_bound_of_the_station():
     system.get_state_max_wrench_input_port().FixValue(context, limit)
     bound = system.get_phase_max_wrench_output_port().Eval(context)
     np.testing.assert_array_equal(bound, bounded.bound.numbers)
-
-
-def test_wrench_limit_of_guidance_without_its_port_is_refused():
-    def guidance(prior):
-        inner, builder = GUIDANCE.get("sct").build(prior), DiagramBuilder()
-        builder.AddSystem(inner)
-        for index in range(inner.num_input_ports()):
-            builder.ExportInput(inner.get_input_port(index), inner.get_input_port(index).get_name())
-        for index in range(inner.num_output_ports()):
-            if (port := inner.get_output_port(index)).get_name() != "state_max_wrench":
-                builder.ExportOutput(port, port.get_name())
-        return builder.Build()
-
-    register_guidance("lab/portless", needs=(("template",),))(guidance)
-    try:
-        make_clamp(with_limits(), guidance="lab/portless")
-        with pytest.raises(InputError, match="no output 'state_max_wrench': export max_wrench of its state machine"):
-            make_clamp(with_limits(max_force_n=6.0), guidance="lab/portless")
-    finally:
-        GUIDANCE._entries.pop("lab/portless")
-
-
-@pytest.mark.parametrize("force", [np.nan, -1.0, 0.0])
-def test_limit_is_refused_when_not_positive(force):
-    with pytest.raises(InputError, match=r"positive|negative"):
-        max_wrench(force)
-
-
-def test_shipped_template_of_the_clamp_has_no_limits():
-    template = EnvConfig.resolve("GridClamp", {}).declared.prior().template
-    assert make_phase_wrench_limit(template.template, None, 0.01) is None

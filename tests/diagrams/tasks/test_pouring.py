@@ -6,7 +6,7 @@ import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.task import START_HEIGHT, START_RADIUS, scripted_pour
+from guiderail.diagrams.tasks.pouring import scripted_pour
 from guiderail.models.common.errors import InputError
 from research.action_fuzzing.pouring import ADVERSARIES
 
@@ -111,46 +111,11 @@ def test_scripted_policy_pours_into_other_mugs_and_positions(mug, position):
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
 
 
-def test_constraints_are_satisfied_with_a_higher_action_repeat():
-    env = make_env("Pouring", reward="sparse", action_repeat=20)
-    info, _, _ = run(env, scripted_pour, seed=3)
-    assert info["termination"] == "success"
-    assert info["control_steps"] < 250
-    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
-    rng = np.random.default_rng(0)
-    info, _, _ = run(env, ADVERSARIES["noisy_pour"](rng), seed=3, max_actions=15)
-    assert info["termination"] not in ("collision", "spill")
-
-
 def test_starts_are_sampled_and_repeat_with_the_seed(env):
     first = env.reset(seed=3)[1]["start"]
     second = env.reset()[1]["start"]
     assert not np.allclose(first, second)
     np.testing.assert_array_equal(env.reset(seed=3)[1]["start"], first)
-
-
-def test_held_out_starts_differ_from_training_starts(env):
-    training = [env.reset(seed=seed)[1]["start"] for seed in range(5)]
-    held_out = [env.reset(seed=seed, options={"held_out": True})[1]["start"] for seed in range(5)]
-    assert not np.isin(held_out, training).any()
-    np.testing.assert_array_equal(env.reset(seed=4, options={"held_out": True})[1]["start"], held_out[4])
-    # Held-out starts have the same range as training starts.
-    radii, heights = np.hypot(*np.transpose(held_out)[:2]), np.transpose(held_out)[2]
-    np.testing.assert_array_equal(np.clip(radii, *START_RADIUS), radii)
-    np.testing.assert_array_equal(np.clip(heights, *START_HEIGHT), heights)
-
-
-def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(env):
-    def episode():
-        observation, _ = env.reset(seed=5)
-        observations = [observation]
-        for _ in range(12):
-            observations.append(env.step(scripted_pour(observations[-1]))[0])
-        return np.array(observations)
-
-    first = episode()
-    run(env, scripted_pour, seed=9, max_actions=12)
-    np.testing.assert_array_equal(episode(), first)
 
 
 def test_balls_rest_in_the_thermos_when_the_action_is_zero(env):
@@ -193,23 +158,6 @@ def test_hand_shaped_reward_is_that_of_the_thesis():
     assert info["approach"] == pytest.approx(15.0 * (distance - distance_after), abs=1e-5)  # float32 observations
     assert info["tilting"] <= 0.0
     assert reward == pytest.approx(info["approach"] + info["tilting"] - 1.0, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"guidance": "kgrl"}, "needs demonstrations, which Pouring doesn't have: use none, sct"),
-        ({"reward": "dense"}, "hand_shaped"),
-        ({"observation": "image"}, "state"),
-        ({"mug_offset": 1.0}, "at most 0.04"),
-        ({"mug_inner_diameter": 0.03}, "too small for the balls"),
-        ({"mug_inner_diameter": 0.03, "ball_diameter": 0.03}, "stay within 0.0375 to 0.2 m and 0.045 to 0.25 m"),
-        ({"input_speed": 5.0}, "at most 2"),
-    ],
-)
-def test_option_is_refused_when_invalid(arguments, message):
-    with pytest.raises(InputError, match=message):
-        make_env("Pouring", **arguments)
 
 
 @pytest.mark.parametrize(

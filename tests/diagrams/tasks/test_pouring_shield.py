@@ -6,9 +6,16 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR, POUR_LINE, THESIS, frames_of, make_template
-from guiderail.diagrams.tasks.pouring.task import scripted_pour, scripted_pour_aimed, scripted_pour_from_above
-from guiderail.models.common.errors import InputError
+from guiderail.diagrams.tasks.pouring import (
+    MAX_MUG_ERROR,
+    POUR_LINE,
+    THESIS,
+    frames_of,
+    make_template,
+    scripted_pour,
+    scripted_pour_aimed,
+    scripted_pour_from_above,
+)
 
 AIM_SPEEDS = {"aim_speed": 1.0, "pour_speed": 0.3}
 PERIOD = 0.01
@@ -76,8 +83,3 @@ def test_scripted_policy_pours_or_spills(options, policy, ending):
 def test_thesis_difficulty_slows_the_inputs():
     assert THESIS["input_speed"] < 0.5
     assert THESIS["time_limit"] > 15.0
-
-
-def test_shield_is_refused_without_aim():
-    with pytest.raises(InputError, match="shield needs the option aim"):
-        make_env("Pouring", guidance="sct", shield=True)

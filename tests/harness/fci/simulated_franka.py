@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware.drivers.fci import FciDriver
 from guiderail_hardware.drivers.fci_lockstep import FciLockstepClock
 from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault

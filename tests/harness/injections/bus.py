@@ -12,7 +12,7 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.driver import safety_limits
 from guiderail_hardware.drivers.lcm import IiwaDriver

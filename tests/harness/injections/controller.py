@@ -6,7 +6,7 @@ import sys
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.clock import WallClock, garbage_collection_disabled, set_realtime_priority
 from guiderail_hardware.robot.sim_driver import START

@@ -23,7 +23,7 @@ from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware.drivers.clock import set_realtime_priority
 from guiderail_hardware.drivers.driver import safety_limits
 from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver

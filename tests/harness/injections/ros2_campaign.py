@@ -22,6 +22,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,14 +39,16 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ros2_robot import use_loopback
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.inverse_kinematics import pose_error
+from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail_hardware.drivers import ros2
 from guiderail_hardware.drivers.ros2 import Ros2Address, Ros2Bus, Ros2Driver
 from guiderail_hardware.models.joint_status import Fault
 from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
+from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 from injections.campaign import DURATION, GROWTH, MAX_STEPS, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
@@ -56,6 +59,7 @@ BANDWIDTH = 60.0  # natural frequency of the critically damped arm [rad/s]
 SETTLING = 0.4  # time from the start of a motion until the arm follows it [s]
 SUBSTEPS = 5  # integration steps of the arm in a period
 PATIENCE = 20.0  # longest wait for a message or an answer [s]
+POLL = 5e-5  # time between two looks at the arrived messages [s]
 HOLD, CONTROLLER, FOREIGN = "hold", "cartesian_controller", "second program"
 # Targets of a second program: share of the distance from the arm to the target, and error of the clock [s].
 SECOND_PROGRAMS = {
@@ -66,6 +70,13 @@ SECOND_PROGRAMS = {
 }
 NAMES = [f"panda_joint{number}" for number in range(1, 8)]
 WITHOUT_DECODING = ("random bytes", "message cut off")  # the middleware decodes messages
+WITHOUT_TORQUES = "torques times"  # commands are poses
+OTHER_ROBOTS = ("second robot", "moving robot")
+
+
+def _is_latency(kind: Kind) -> bool:
+    """Return True for a fault that delays all messages by the same time."""
+    return kind.name.endswith("ms late for ever")
 
 
 def _lossy(rng: np.random.Generator):
@@ -89,12 +100,13 @@ OWN_KINDS = (
     Kind("wrenches lost", ros2.MAX_WRENCH_AGE + NEXT, lambda rng: lambda message, elapsed: [message]),
     Kind("joint missing", NEXT, lambda rng: lambda message, elapsed: [message]),
 )
-# Without a safety monitor at the robot, lost commands are not reported: the controller holds its last target.
-UNREPORTED = ("commands lost", "commands 60 ms late", "controller killed", "controller stopped")
+# Without a safety monitor at the robot, lost commands are not reported: the controller holds its last target. Nor is a
+# constant latency, because the loop of forces is closed at the robot.
+SILENT = ("commands lost", "controller killed", "controller stopped")
 CAMPAIGN = [
-    replace(kind, bound=UNDETECTED) if kind.name in UNREPORTED else kind
+    replace(kind, bound=UNDETECTED) if kind.name in (*SILENT, "commands 60 ms late") or _is_latency(kind) else kind
     for kind in (*KINDS, *OWN_KINDS)
-    if kind.name not in WITHOUT_DECODING and kind.action[1] != "monitor"
+    if kind.name not in WITHOUT_DECODING and kind.action[1] != "monitor" and not kind.name.startswith(WITHOUT_TORQUES)
 ]
 
 
@@ -121,6 +133,7 @@ class Arm:
         self.positions, self.velocities = self._model.solve(START, self._model.posture), np.zeros(7)
         self.steps, self._taken, self.num_foreign = 0, 0, 0
         self._target = self._held = self.pose()
+        self._before = self.positions, self.velocities
         self._is_holding = True
         self._faults: list[tuple[Kind, Any, int]] = []
 
@@ -137,6 +150,7 @@ class Arm:
     def step(self, sent: int) -> dict:
         """Advance by a period, after the arrival of `sent` targets in total; return the numbers of sent messages."""
         self.steps += 1
+        self._before = self.positions, self.velocities
         effect = self._receive(sent)
         for _ in range(SUBSTEPS):
             self._integrate(PERIOD / SUBSTEPS)
@@ -150,6 +164,19 @@ class Arm:
     def speed(self) -> float:
         """Speed of the fastest joint [rad/s]."""
         return float(np.abs(self.velocities).max())
+
+    def predict(self, targets: list[list[float]]) -> list[float]:
+        """Return the speed of the fastest joint in the last step and the next ones, if it follows targets (n, 7)."""
+        now = self.positions, self.velocities, self._target
+        self.positions, self.velocities = self._before
+        speeds = []
+        for target in targets:
+            self._target = RigidTransform(RotationMatrix(Quaternion(target[3:])), target[:3])
+            for _ in range(SUBSTEPS):
+                self._integrate(PERIOD / SUBSTEPS)
+            speeds.append(self.speed)
+        self.positions, self.velocities, self._target = now
+        return speeds
 
     def _since(self, start: int) -> float:
         return (self.steps - start) * PERIOD
@@ -180,6 +207,8 @@ class Arm:
             self._taken += len(own)
             if time.monotonic() > end:
                 raise SystemExit(f"{self._taken} of {sent} targets arrived")
+            if self._taken < sent:
+                time.sleep(POLL)
         self.serve()
         effect = False
         for kind, fault, start in self._faults:
@@ -244,8 +273,8 @@ class Arm:
                 continue
             changed = []
             for each, is_other in relayed:
-                for index, out in enumerate(fault(each, self._since(start))):
-                    changed.append((out, is_other or (index > 0 and kind.name.startswith("second robot"))))
+                for out in fault(each, self._since(start)):
+                    changed.append((out, is_other or (out != each and kind.name.startswith(OTHER_ROBOTS))))
             effect |= kind in OWN_KINDS or has_effect(message, [out for out, _ in changed], kind.where)
             relayed = changed
         names = {kind.name for kind, _, _ in self._faults}
@@ -279,6 +308,8 @@ def play_arm(address: str) -> None:
             arm.begin(request["kinds"], request["seed"])
         elif request["do"] == "step":
             answer = arm.step(request["sent"])
+        elif request["do"] == "predict":
+            answer = {"speeds": arm.predict(request["targets"])}
         elif request["do"] == "greet":
             answer = {"arrived": arm.greet()}
         else:
@@ -319,6 +350,7 @@ class CountingBus(Ros2Bus):
                 return
             if time.monotonic() > end:
                 raise SystemExit(f"{self._counts} of {self.expected} messages arrived")
+            time.sleep(POLL)
 
     def take(self, reader: Any) -> list[Any]:
         """Return the messages that have arrived, oldest first."""
@@ -345,9 +377,13 @@ class Campaign:
         self.station = HardwareStation(
             BncWorkcell(), Ros2Driver(self.address, bus=self.bus), robot="panda", robot_timeout=1.0
         )
+        plant = self.station.controller_plant.plant
+        self.X_BaseTarget = self.station.controller_plant.target.CalcPoseInWorld(plant.CreateDefaultContext())
+        self.limiter = PoseMotionLimiter(Ros2Driver.motion_limits, period=PERIOD)
+        self.limiter_states: deque[np.ndarray] = deque(maxlen=2)  # before each of the last two steps
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
-        self.station.get_desired_pose_input_port().FixValue(self.context, self.desired())
+        self.station.get_desired_pose_input_port().FixValue(self.context, self.desired(self.step))
         self._step_arm()
         self.station.start(self.simulator)
 
@@ -363,6 +399,7 @@ class Campaign:
 
     def _connect(self) -> None:
         """Exchange messages until every connection is known to the other process."""
+        self.ask(do="greet")  # the other process has started
         end, missing = time.monotonic() + PATIENCE, True
         while missing:
             self.bus.writer.write(self.bus.messages.PoseStamped())
@@ -388,18 +425,21 @@ class Campaign:
 
     def step_once(self) -> None:
         """Advance both processes by a period."""
+        limiter = self.station.GetSubsystemByName("rate_limiter")
+        state = limiter.GetMyContextFromRoot(self.context).get_discrete_state_vector().CopyToVector()
+        self.limiter_states.append(state)
         self.step += 1
         if self.has_robot:
             self._step_arm()
         if self.has_controller:
-            self.station.get_desired_pose_input_port().FixValue(self.context, self.desired())
+            self.station.get_desired_pose_input_port().FixValue(self.context, self.desired(self.step))
             self.simulator.AdvancePendingEvents()
             self.station.receive(self.context, self.now())
             self.simulator.AdvanceTo(self.context.get_time() + PERIOD)
 
-    def desired(self) -> np.ndarray:
-        """Return the desired pose: on a circle, with an oscillating rotation."""
-        phase = 2.0 * np.pi * FREQUENCY * self.now()
+    def desired(self, step: int) -> np.ndarray:
+        """Return the desired pose in a step: on a circle, with an oscillating rotation."""
+        phase = 2.0 * np.pi * FREQUENCY * step * PERIOD
         return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, ROTATION * np.sin(phase), 0.0, 0.0]
 
     @property
@@ -429,25 +469,35 @@ class Campaign:
         else:
             raise AssertionError(f"does not resume: {self.arm_state.name}, {self.fault.name}")
 
-    def run_undisturbed(self, seconds: float) -> np.ndarray:
-        """Advance until the arm has followed its command for `SETTLING` and a period of the motion, and for `seconds`.
-
-        Returns:
-            Speed of the fastest joint in each step of a period [rad/s]. It depends on the posture of the arm, which has
-            more joints than its task needs, and which a fault changes.
-        """
-        steps = round(1.0 / FREQUENCY / PERIOD)
-        speeds, number = np.zeros(steps), 0
-        while number < steps + round((SETTLING + seconds) / PERIOD):
+    def run_undisturbed(self, seconds: float) -> None:
+        """Advance until the arm has followed its command for `SETTLING`, and for a time [s]."""
+        number = 0
+        while number < round((SETTLING + seconds) / PERIOD):
             if self.is_detected:
                 number = 0
                 self.run_until_following()
             self.step_once()
             number += 1
-            speeds[self.step % steps] = self.speed
-        return speeds
 
-    def inject(self, kinds: tuple[Kind, ...], speeds: np.ndarray, seed: list[int]) -> Result:
+    def predict_speed(self, steps: int) -> float:
+        """Return the largest speed of a joint in the last step and the next ones if there were no fault [rad/s].
+
+        The speed changes from one period of the motion to the next, because the limiter of the desired poses does not
+        follow it exactly. The limiter's targets depend on the desired poses only, and are computed ahead.
+        """
+        limiter, ahead, first = self.limiter, [], self.step - 1
+        context = limiter.CreateDefaultContext()
+        context.SetDiscreteState(self.limiter_states[0])
+        limiter.get_blend_factor_input_port().FixValue(context, [1.0])
+        limiter.get_pose_input_port().FixValue(context, self.desired(first))  # not used while the arm is controlled
+        for step in range(first, first + steps):
+            limiter.get_desired_pose_input_port().FixValue(context, self.desired(step))
+            X = self.X_BaseTarget @ pose_to_transform(limiter.get_limited_pose_output_port().Eval(context))
+            ahead.append([*X.translation().tolist(), *X.rotation().ToQuaternion().wxyz().tolist()])
+            context.SetDiscreteState(limiter.EvalUniquePeriodicDiscreteUpdate(context).value().copy())
+        return max(self.ask(do="predict", targets=ahead)["speeds"])
+
+    def inject(self, kinds: tuple[Kind, ...], seed: list[int]) -> Result:
         """Inject one or more faults at the same time, and observe the arm for `DURATION`."""
         result, first_step, start = Result(np.nan, "", 0.0, 0.0, []), self.step, None
         bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
@@ -467,7 +517,7 @@ class Campaign:
             if start is None and self.has_effect:
                 start = self.step - 1
             if start is not None and speed == 0.0:
-                speed = max(before, speeds[(start + np.arange(1 + reach)) % len(speeds)].max())
+                speed = max(before, self.predict_speed(reach)) if self.has_robot else before
             elapsed = 0.0 if start is None else (self.step - start) * PERIOD
             if np.isnan(result.detected) and self.is_detected:
                 result.detected, result.cause = elapsed, self.fault.name
@@ -479,10 +529,10 @@ class Campaign:
         is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
         if is_detectable and not result.detected <= bound + 1e-9:
             result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
-        is_silent = any(kind.name in UNREPORTED and "late" not in kind.name for kind in kinds)
+        is_silent = any(kind.name in SILENT for kind in kinds)
         if (is_detectable or is_silent) and result.late_speed >= SLOW:
             result.failures.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
-        if is_detectable and result.growth > GROWTH:
+        if (is_detectable or is_silent or any(map(_is_latency, kinds))) and result.growth > GROWTH:
             result.failures.append(f"{result.growth:.2f} times as fast")
         return result
 
@@ -516,8 +566,7 @@ def main() -> int:
         return 0
     use_loopback()
     started, domains = time.monotonic(), itertools.cycle(range(20 + os.getpid() % 100, 230))
-    campaign = Campaign(next(domains))
-    speeds = campaign.run_undisturbed(0.0)
+    campaign, last = Campaign(next(domains)), Result(np.nan, "", 0.0, 0.0, [])
     kinds = [kind for kind in CAMPAIGN if not arguments.kinds or kind.name in arguments.kinds]
     results: dict[str, list[Result]] = {kind.name: [] for kind in kinds}
     for instant in range(arguments.instants):
@@ -526,16 +575,17 @@ def main() -> int:
         injections += list(pairs_of(kinds, arguments.pairs // arguments.instants, rng))
         for number, chosen in enumerate(injections):
             wait = float(rng.uniform(0.02, 0.3))
-            result = campaign.inject(chosen, speeds, [arguments.seed, instant, number])
-            if campaign.arm.poll() is not None:  # killed; its connections stay known for a while
-                campaign = Campaign(next(domains))
             try:
-                speeds = campaign.run_undisturbed(wait)
+                campaign.run_undisturbed(wait)
             except AssertionError as error:
-                result.failures.append(str(error))
+                last.failures.append(str(error))
+                print(f"FAIL  after the fault before: {error}", flush=True)
                 campaign.close()
                 campaign = Campaign(next(domains))
-                speeds = campaign.run_undisturbed(wait)
+                campaign.run_undisturbed(wait)
+            last = result = campaign.inject(chosen, [arguments.seed, instant, number])
+            if campaign.arm.poll() is not None:  # killed; its connections stay known for a while
+                campaign = Campaign(next(domains))
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
             for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)

@@ -62,8 +62,8 @@ TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
     "models/templates/active_constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
-    "models/templates/geometry.py": TEMPLATES,
-    "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
+    "models/templates/parts.py": TEMPLATES,
+    "models/control/command_filters.py": ["tests/models/control/test_keep_out.py"],
     "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/joint_status.py": [f"{HARDWARE}/tests/models/test_joint_status.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/message_sequence.py": [
@@ -84,18 +84,16 @@ TARGETS = {
         for path in sorted((ROOT / HARDWARE / "src/guiderail_hardware/systems").glob("*.py"))
         if path.stem != "__init__"
     },
-    "systems/support/last_valid_pose.py": [
+    "systems/support/last_valid.py": [
         "tests/systems/test_command_watchdog.py",
-        f"{HARDWARE}/tests/systems/test_torque_safety_limiter.py",
-    ],
-    "systems/support/last_valid_bound.py": [
         "tests/systems/test_energy_tank.py",
         "tests/systems/test_cartesian_impedance_controller.py",
+        f"{HARDWARE}/tests/systems/test_torque_safety_limiter.py",
     ],
 }
 SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
 # Modules without mutants whose import is slow: imported before a process is forked for each mutant.
-SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "pydrake.math", "pytest")
 SLOW_IMPORTS += (
     "scipy.optimize",
     "scipy.sparse",

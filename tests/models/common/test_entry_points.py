@@ -5,8 +5,7 @@ import sys
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import BUILT_IN
-from guiderail.models.common.registry import Registry, check_callable
+from guiderail.models.common.registry import BUILT_IN, Registry, check_callable
 
 
 @pytest.fixture

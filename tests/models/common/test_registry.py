@@ -11,8 +11,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import BUILT_IN
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.registry import BUILT_IN, Registry
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS
 from guiderail.tools.learning.learner import LEARNERS

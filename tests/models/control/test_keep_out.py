@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.control.command_filters import KeepOut
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 MARGIN = 0.02
@@ -21,34 +21,20 @@ def clearance(point):
     return clearances(*PassageGeometry().walls, point).min()
 
 
-def test_free_motion_is_not_changed(keep_out):
-    safe, blocked = keep_out.project(np.array([0.3, 0.2]), np.array([0.45, 0.3]))
-    np.testing.assert_array_equal(safe, [0.45, 0.3])
-    assert not blocked
-
-
-def test_motion_stops_before_constraints_without_a_box(keep_out):
-    safe, blocked = keep_out.project(np.array([0.5, 0.2]), np.array([0.8, 0.25]))
-    np.testing.assert_allclose(safe, [0.58, 0.25], atol=1e-12)
-    assert not blocked
-
-
-def test_step_through_a_wall_stops_before_the_margin(keep_out):
-    safe, blocked = keep_out.project(np.array([0.2, 0.3]), np.array([0.2, 0.9]))
-    np.testing.assert_allclose(safe, [0.2, 0.48], atol=1e-5)
-    assert blocked
-
-
-def test_target_inside_a_wall_slides_along_the_nearest_face(keep_out):
-    safe, blocked = keep_out.project(np.array([0.2, 0.4]), np.array([0.25, 0.49]))
-    np.testing.assert_allclose(safe, [0.25, 0.48], atol=1e-5)
-    assert blocked
-
-
-def test_motion_through_the_gap_is_not_changed(keep_out):
-    safe, blocked = keep_out.project(np.array([0.35, 0.45]), np.array([0.35, 0.65]))
-    np.testing.assert_array_equal(safe, [0.35, 0.65])
-    assert not blocked
+@pytest.mark.parametrize(
+    ("start", "target", "reached", "is_blocked"),
+    [
+        ([0.3, 0.2], [0.45, 0.3], [0.45, 0.3], False),  # free motion
+        ([0.5, 0.2], [0.8, 0.25], [0.58, 0.25], False),  # beyond the constraints, where no box is
+        ([0.2, 0.3], [0.2, 0.9], [0.2, 0.48], True),  # through a wall
+        ([0.2, 0.4], [0.25, 0.49], [0.25, 0.48], True),  # into a wall, along its nearest face
+        ([0.35, 0.45], [0.35, 0.65], [0.35, 0.65], False),  # through the gap
+    ],
+)
+def test_motion_ends_before_the_margin(keep_out, start, target, reached, is_blocked):
+    safe, blocked = keep_out.project(np.array(start), np.array(target))
+    np.testing.assert_allclose(safe, reached, rtol=0.0, atol=1e-5 if is_blocked else 1e-12)
+    assert blocked == is_blocked
 
 
 def test_motion_stops_before_the_margin_for_any_length():
@@ -240,19 +226,26 @@ def test_first_of_two_walls_stops_the_motion():
         assert safe[0] == pytest.approx(wall, abs=1e-5)
 
 
-def test_constructor_refuses_invalid_arguments():
-    none = LinearConstraints.none(2)
-    stepwise = LinearConstraints(np.zeros((3, 1, 2)), -np.ones((3, 1)))
-    for lower, upper, constraints in (
-        ([[0, 0]], [[1, 1]], LinearConstraints.none(3)),
-        ([[0, 0]], [[1, 1]], stepwise),
-        ([[0, 0], [0, 0]], [[1, 1]], none),
-        ([[0, 0]], [[1]], none),
-        ([[0, 0]], [[1, 0]], none),
-    ):
-        with pytest.raises(InputError):
-            KeepOut(lower, upper, constraints, 0.1)
-    assert KeepOut([[0, 0]], [[1, 1]], none, 0.0).margin == 0.0
+NONE = LinearConstraints.none(2)
+UNIT = [[0.0, 0.0]], [[1.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "constraints", "margin"),
+    [
+        (*UNIT, LinearConstraints.none(3), 0.1),
+        (*UNIT, LinearConstraints(np.zeros((3, 1, 2)), -np.ones((3, 1))), 0.1),
+        ([[0, 0], [0, 0]], [[1, 1]], NONE, 0.1),
+        ([[0, 0]], [[1]], NONE, 0.1),
+        ([[0, 1]], [[2, 1]], NONE, 0.0),
+        ([[0, 1]], [[2, 0.9995]], NONE, 0.0),
+        *((*UNIT, NONE, margin) for margin in (-1e-9, np.inf, np.nan)),
+    ],
+)
+def test_constructor_refuses_invalid_arguments(lower, upper, constraints, margin):
+    with pytest.raises(InputError):
+        KeepOut(lower, upper, constraints, margin)
+    KeepOut([[0.0, 1.0]], [[2.0, np.nextafter(1.0, 2.0)]], NONE, 0.0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -285,19 +278,6 @@ def test_half_space_of_a_box_is_at_the_face_of_most_clearance(position, face, bo
     axis = int(np.argmax(position))
     np.testing.assert_array_equal(G[2], np.eye(3)[axis])
     assert c[2] == -8.0 + 0.25
-
-
-@pytest.mark.parametrize("margin", [-1e-9, np.inf, np.nan])
-def test_constructor_refuses_a_margin_out_of_range(margin):
-    with pytest.raises(InputError, match="margin must be finite and 0 or more"):
-        KeepOut([[0.0]], [[1.0]], LinearConstraints.none(1), margin)
-
-
-@pytest.mark.parametrize("upper", [1.0, 0.9995])
-def test_constructor_refuses_a_box_without_volume(upper):
-    with pytest.raises(InputError, match="lower corner below its upper"):
-        KeepOut([[0.0, 1.0]], [[2.0, upper]], LinearConstraints.none(2), 0.0)
-    KeepOut([[0.0, 1.0]], [[2.0, np.nextafter(1.0, 2.0)]], LinearConstraints.none(2), 0.0)
 
 
 def test_projection_satisfies_a_second_violated_constraint():

@@ -15,7 +15,6 @@ from oracles.franka import FRANKA_LIMITS
 PERIOD = 0.02
 LINEAR = LinearConstraints.box([0.0, 0.0], [0.6, 1.0])
 OUTSIDE = (Sphere([0.5, 0.3], 0.08), Box([0.1, 0.5], [0.3, 0.6], 0.01))
-INSIDE = (Sphere([0.4, 0.4], 0.5),)
 SPEED, ACCELERATION = np.array([0.5, 0.4]), np.array([2.0, 3.0])
 LIMITS = {
     "no limits": (None, None),
@@ -26,15 +25,15 @@ LIMITS = {
 
 
 def test_no_command_and_no_path_enters_a_spherical_obstacle():
-    results = attack(2400, seed=5)
+    results = attack(600, seed=5)
     for kind in KINDS:
         assert not is_violated(kind, results[kind]), (kind, results[kind])
-    assert sum(result.touching for result in results.values()) > 50  # the adversary reaches the obstacles
+    assert sum(result.touching for result in results.values()) > 10  # the adversary reaches the obstacles
 
 
 @pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
 def test_constraints_are_satisfied_for_any_desired_command(limits):
-    motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
+    motion = MotionConstraints(LINEAR, OUTSIDE, *limits)
     law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
     state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
     worst, clearance, displacements = -np.inf, np.inf, [np.zeros(2)]
@@ -59,7 +58,7 @@ def test_constraints_are_satisfied_for_any_desired_command(limits):
 
 @pytest.mark.parametrize("size", [1e8, 1e20, 1e150, 1e300])
 def test_constraints_are_satisfied_for_huge_desired_commands(size):
-    motion = MotionConstraints(LinearConstraints.none(2), OUTSIDE, INSIDE, SPEED, ACCELERATION)
+    motion = MotionConstraints(LinearConstraints.none(2), OUTSIDE, SPEED, ACCELERATION)
     law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
     state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
     for k in range(200):
@@ -84,14 +83,14 @@ def test_command_is_projected_when_constraints_are_violated():
 
 @pytest.mark.parametrize("linear", [LINEAR, LinearConstraints.none(2)])
 def test_violation_by_a_command_with_nan_is_nan(linear):
-    constraints = MotionConstraints(linear, OUTSIDE, [Sphere([0.0, 0.0], 1.0)])
+    constraints = MotionConstraints(linear, OUTSIDE)
     assert np.isnan(constraints.violation(np.full(2, np.nan)))
     assert np.isnan(constraints.violations(np.full(2, np.nan)).shapes)
 
 
 @pytest.mark.parametrize("desired", [[np.nan, 0.0], [np.inf, 0.0]])
 def test_command_that_is_not_finite_brakes(desired):
-    law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE, (), SPEED, ACCELERATION), PERIOD)
+    law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE, SPEED, ACCELERATION), PERIOD)
     state = np.array([0.3, 0.3, 0.004, -0.002])
     speeds = []
     for _ in range(10):
@@ -103,7 +102,7 @@ def test_command_that_is_not_finite_brakes(desired):
 
 
 def test_filter_brakes_when_the_wall_is_at_braking_distance():
-    motion = MotionConstraints(LinearConstraints.box([0.0, 0.0], [0.6, 1.0]), (), (), SPEED, ACCELERATION)
+    motion = MotionConstraints(LinearConstraints.box([0.0, 0.0], [0.6, 1.0]), (), SPEED, ACCELERATION)
     law = MotionConstraintFilter(motion, PERIOD)
     displacement, change = 0.005, PERIOD**2 * 2.0
     braking = sum(displacement - k * change for k in range(1, 7))
@@ -119,11 +118,11 @@ def test_filter_brakes_when_the_wall_is_at_braking_distance():
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3, 6])
-@pytest.mark.parametrize("kind", ["linear", "outside", "inside", "state"])
+@pytest.mark.parametrize("kind", ["linear", "outside", "state"])
 def test_start_too_fast_to_brake_exceeds_only_acceleration(dims, kind):
     """One output moves at 1 m/s, 5 cm before its limit; its braking distance at 2 m/s² is 25 cm."""
     limit = LinearConstraints(-np.eye(dims)[:1], np.array([-0.05]))
-    shapes = {"outside": [Sphere(np.eye(dims)[0] * 0.15, 0.1)], "inside": [Sphere(np.zeros(dims), 0.05)]}
+    shapes = {"outside": [Sphere(np.eye(dims)[0] * 0.15, 0.1)]}
     shapes["state"] = [FirstOutputLimit(limit)]
     linear = limit if kind == "linear" else LinearConstraints.none(dims)
     motion = MotionConstraints(linear, max_acceleration=[2.0] * dims, **{kind: shapes[kind]} if kind in shapes else {})
@@ -142,14 +141,6 @@ def test_start_too_fast_to_brake_exceeds_only_acceleration(dims, kind):
     assert displacement == 0.02 if kind == "outside" else displacement < 2.0 * PERIOD**2
 
 
-def test_start_that_would_cross_the_allowed_region_stops():
-    law = MotionConstraintFilter(
-        MotionConstraints(LinearConstraints.none(1), inside=[Sphere([0.0], 0.01)], max_acceleration=[2.0]), PERIOD
-    )
-    for speed, is_unchanged in ((0.004, True), (0.02, False)):
-        assert (law.start(np.array([-0.02]), np.array([speed]))[1] == speed) == is_unchanged
-
-
 def test_motion_along_a_gap_without_width_is_possible():
     """The half spaces of both walls contain the last command, so that a next command exists."""
     walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
@@ -162,7 +153,7 @@ def test_motion_along_a_gap_without_width_is_possible():
 @pytest.mark.parametrize("start", [[0.52, 0.31], [0.2, 0.55], [0.7, 0.3], [-0.3, 0.5]])
 @pytest.mark.parametrize("limits", [(None, None), (SPEED, None), (SPEED, ACCELERATION)])
 def test_start_outside_the_constraints_converges_inside(start, limits):
-    motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
+    motion = MotionConstraints(LINEAR, OUTSIDE, *limits)
     law = MotionConstraintFilter(motion, PERIOD)
     state, violations = law.start(np.array(start)), [motion.violation(np.array(start))]
     assert violations[0] > 1e-3
@@ -174,7 +165,7 @@ def test_start_outside_the_constraints_converges_inside(start, limits):
 
 
 def test_limits_apply_to_outputs_without_a_position():
-    motion = MotionConstraints(LinearConstraints.none(3), OUTSIDE, (), [np.inf, np.inf, 0.1])
+    motion = MotionConstraints(LinearConstraints.none(3), OUTSIDE, [np.inf, np.inf, 0.1])
     law = MotionConstraintFilter(motion, PERIOD)
     state, _ = law.apply(law.start(np.array([0.3, 0.3, 0.0])), np.array([0.32, 0.3, 1.0]))
     np.testing.assert_allclose(state[:3], [0.32, 0.3, 0.002], atol=1e-12)
@@ -185,7 +176,6 @@ def test_limits_apply_to_outputs_without_a_position():
     [
         ({"linear": LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2)))}, "do not change"),
         ({"outside": [Sphere([0.0, 0.0, 0.0], 0.1)]}, "dimensions"),
-        ({"inside": [Sphere([0.0, 0.0, 0.0], 0.1)]}, "dimensions"),
         ({"max_speed": [0.1]}, "max_speed"),
         ({"max_speed": [0.1, 0.0]}, "max_speed"),
         ({"max_acceleration": [0.1, np.nan]}, "max_acceleration"),
@@ -230,7 +220,7 @@ class AngleLimit:
 def test_lengths_and_angles_have_separate_violations(output, expected, largest):
     """The violation as one number is the largest violation, with an angle as the arc at a radius of 0.25 m."""
     linear = LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-0.1]))
-    constraints = MotionConstraints(linear, inside=[Sphere([0.0], 0.2)], state=[AngleLimit()])
+    constraints = MotionConstraints(linear, outside=[Box([0.2], [np.inf])], state=[AngleLimit()])
     np.testing.assert_allclose(constraints.violations(np.array(output)), expected, atol=1e-12)
     assert constraints.violation(np.array(output)) == pytest.approx(largest, abs=1e-12)
 

@@ -15,8 +15,7 @@ from guiderail.models.primitives import (
     ReferenceTrajectory,
     UnsolvableError,
 )
-from guiderail.systems.history import HistoryBuffer
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import HistoryBuffer, LcNsKmpSystem
 
 PERIOD, STEPS = 0.02, 40
 GAIN = np.array([20.0, 30.0])

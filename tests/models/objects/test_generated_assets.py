@@ -8,12 +8,10 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector import sdf as bnc_sdf
-from guiderail.models.objects.bnc_connector.geometry import BORE_SIDES, FOLDER, LIP_RISE, LIP_WIDTH, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION
-from guiderail.models.objects.grid_clamp import sdf as grid_clamp_sdf
-from guiderail.models.objects.grid_clamp.geometry import FOLDER as GRID_CLAMP_FOLDER
-from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions
+from guiderail.models.objects import bnc_connector, grid_clamp
+from guiderail.models.objects.bnc_connector import BORE_SIDES, FOLDER, FRICTION, LIP_RISE, LIP_WIDTH, BncDimensions
+from guiderail.models.objects.grid_clamp import FOLDER as GRID_CLAMP_FOLDER
+from guiderail.models.objects.grid_clamp import NUM_SIDES, GridClampDimensions
 from guiderail.models.objects.sdf import TriangleMesh, equal_area_radius
 
 
@@ -25,8 +23,8 @@ def read_vertices(path):
 @pytest.mark.parametrize(
     ("folder_of", "dimensions", "folder"),
     [
-        (bnc_sdf.folder_of, BncDimensions(), FOLDER),
-        (grid_clamp_sdf.folder_of, GridClampDimensions(), GRID_CLAMP_FOLDER),
+        (bnc_connector.folder_of, BncDimensions(), FOLDER),
+        (grid_clamp.folder_of, GridClampDimensions(), GRID_CLAMP_FOLDER),
     ],
 )
 def test_folder_of_returns_the_shipped_folder_by_default(folder_of, dimensions, folder):
@@ -36,8 +34,8 @@ def test_folder_of_returns_the_shipped_folder_by_default(folder_of, dimensions, 
 
 def test_generated_connector_has_the_given_dimensions():
     dimensions = dataclasses.replace(BncDimensions().with_bore_clearance(0.07 * MM), mouth_chamfer=0.25 * MM)
-    folder = bnc_sdf.folder_of(dimensions, 0.35)
-    assert bnc_sdf.folder_of(dimensions, 0.35) == folder != FOLDER
+    folder = bnc_connector.folder_of(dimensions, 0.35)
+    assert bnc_connector.folder_of(dimensions, 0.35) == folder != FOLDER
     bore, corner = read_vertices(folder / "bnc_bore.obj"), equal_area_radius(1.0, BORE_SIDES)
     radii = np.hypot(*bore[:, :2].T) / corner
     np.testing.assert_allclose(radii[bore[:, 2] > 1.0 * MM], 4.825 * MM + 0.07 * MM, atol=1e-8)
@@ -54,7 +52,7 @@ def test_generated_connector_has_the_given_dimensions():
 
 def test_generated_slot_has_the_given_width():
     standard, wide = (
-        read_vertices(bnc_sdf.folder_of(dimensions) / "bnc_slots.obj")
+        read_vertices(bnc_connector.folder_of(dimensions) / "bnc_slots.obj")
         for dimensions in (BncDimensions(), dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM))
     )
     assert wide[:, 2].max() - standard[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
@@ -64,7 +62,7 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
     dimensions = dataclasses.replace(
         GridClampDimensions().with_clearance(0.1 * MM), hole_chamfer=0.3 * MM, peg_chamfer=0.2 * MM
     )
-    folder = grid_clamp_sdf.folder_of(dimensions, 0.3)
+    folder = grid_clamp.folder_of(dimensions, 0.3)
     inradius_ratio = np.cos(np.pi / NUM_SIDES)  # distance of a polygon's sides over that of its corners
     hole, peg = read_vertices(folder / "grid_clamp_hole.obj"), read_vertices(folder / "grid_clamp_peg.obj")
     assert np.hypot(*hole[:, :2].T).min() * inradius_ratio == pytest.approx(4.1 * MM, abs=1e-8)

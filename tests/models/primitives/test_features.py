@@ -3,11 +3,9 @@
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from guiderail.models.primitives import Matern52, SquaredExponential
-from guiderail.models.primitives.features import KernelBasis, window_features
+from guiderail.models.primitives.features import window_features
 
 KERNELS = [SquaredExponential(0.5), SquaredExponential(0.1), Matern52(0.4)]
 
@@ -48,44 +46,3 @@ def test_number_of_features_is_the_rank_of_the_kernel():
     rough = window_features(SquaredExponential(np.sqrt(5e-6)), np.zeros(0), np.linspace(0, 1, 60), 0.0)
     assert smooth.features.shape[1] <= 12
     assert rough.features.shape[1] == 60
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
-def test_basis_represents_its_inputs_and_returns_the_residual(seed, dimensions):
-    rng = np.random.default_rng(seed)
-    kernel = SquaredExponential(np.sqrt(0.5 / rng.uniform(0.1, 5)))
-    inputs, other_inputs = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
-    basis = KernelBasis(kernel, inputs)
-    F = basis.features(inputs)
-    assert F.shape == (15, basis.size)
-    np.testing.assert_allclose(F @ F.T, kernel(inputs, inputs), rtol=0, atol=1e-13)
-    assert np.abs(basis.residual(inputs, F)).max() < 1e-13
-
-    # At other inputs, the features explain the kernel with the basis inputs; the residual is the rest of the diagonal.
-    G = basis.features(other_inputs)
-    np.testing.assert_allclose(G @ F.T, kernel(other_inputs, inputs), rtol=0, atol=1e-6)
-    residual = basis.residual(other_inputs, G)
-    np.testing.assert_allclose(residual, 1 - (G**2).sum(axis=1), rtol=0, atol=1e-14)
-    assert (residual >= -1e-13).all()
-
-    before = basis.size
-    assert not basis.extend(inputs[:5])
-    assert basis.size == before
-    is_extended = basis.extend(other_inputs)
-    assert is_extended == (basis.size > before)
-    everything = np.vstack([inputs, other_inputs])
-    H = basis.features(everything)
-    np.testing.assert_allclose(H @ H.T, kernel(everything, everything), rtol=0, atol=1e-13)
-    # The first features are unchanged by the extension.
-    np.testing.assert_allclose(H[:15, :before], F, rtol=0, atol=1e-9)
-
-
-def test_basis_adds_a_feature_for_each_distinct_point():
-    kernel = SquaredExponential(np.sqrt(0.5))
-    assert KernelBasis(kernel, np.array([[0.0], [100.0], [200.0]])).size == 3
-    assert KernelBasis(kernel, np.array([[1.0], [1.0], [1.0]])).size == 1
-    empty = KernelBasis(kernel, np.zeros((0, 1)))
-    assert empty.size == 0
-    assert empty.features(np.ones((2, 1))).shape == (2, 0)
-    assert not empty.extend(np.zeros((0, 1)))
-    assert empty.extend(np.ones((1, 1)))

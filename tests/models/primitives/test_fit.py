@@ -4,27 +4,35 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential, mixture
-from guiderail.models.primitives.fit import MIN_SHARE, estimated_share, fit, motion_without_actions, share_within_spread
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential, mixture
+from guiderail.models.primitives.deviation import outputs_at
+from guiderail.models.primitives.fit import LONG, MIN_SHARE, fit, share_within_spread
 from guiderail.models.primitives.mixture import information_criteria
-from oracles.handwriting import LETTERS, make_correlated, share_within_deviation, write_letter
+from oracles.handwriting import make_correlated, share_within_deviation, write_letter
+
+
+def motion(selection):
+    """Return the outputs (N, O) of a fitted primitive without actions."""
+    reference, steps = selection.reference, np.arange(selection.reference.num_steps)
+    return outputs_at(reference, selection.kernel, 2.0 * selection.lambda_, 40, steps)
+
 
 # The unit and the origin of the coordinates must not affect the fit.
 PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 
 # `letters.py` in this folder prints the selection for letters with more demonstrations and steps.
-@pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
+@pytest.mark.parametrize(("letter", "page"), list(zip("Ne", PAGES, strict=True)))
 def test_fitted_letter_stays_within_the_demonstrations(letter, page):
     selection = fit(write_letter(letter, count=4, steps=60, **page))
     assert selection.is_within_spread
-    assert selection.share == share_within_spread(selection.primitive()) >= MIN_SHARE
+    assert selection.share >= MIN_SHARE
     assert f"{selection.components} components have the least information criterion" in selection.why
 
 
 def test_fitted_letter_with_corners_stays_within_the_deviation():
     letter = write_letter("B", count=5, steps=100)
-    assert share_within_deviation(letter, motion_without_actions(fit(letter).primitive())) >= MIN_SHARE
+    assert share_within_deviation(letter, motion(fit(letter))) >= MIN_SHARE
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +51,14 @@ def test_fit_reproduces_correlated_outputs(demonstrations, selection):
     deviations = outputs - outputs.mean(axis=0)
     assert np.corrcoef(deviations.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
     assert selection.is_within_spread
-    assert share_within_deviation(demonstrations, motion_without_actions(selection.primitive())) >= MIN_SHARE
+    assert share_within_deviation(demonstrations, motion(selection)) >= MIN_SHARE
 
 
 def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
     chosen = next(
-        c for c in selection.candidates if (c.length_scale, c.lambda_) == (selection.length_scale, selection.lambda_)
+        c
+        for c in selection.candidates
+        if (c.length_scale, c.lambda_) == (selection.kernel.length_scale, selection.lambda_)
     )
     assert chosen.worse <= 1
     assert chosen.share >= MIN_SHARE
@@ -56,35 +66,24 @@ def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
         if candidate.worse <= 1 and candidate.share >= MIN_SHARE:
             assert (-candidate.lambda_, -candidate.length_scale) >= (-chosen.lambda_, -chosen.length_scale)
     assert min(c.worse for c in selection.candidates) == 0
-    assert selection.beta == selection.lambda_
     assert selection.components == min(selection.criteria, key=lambda count: selection.criteria[count])
     for number in (selection.components, f"{selection.share:.1%}", f"{selection.lambda_:.3g}"):
         assert str(number) in selection.why
 
 
-def test_fit_is_invariant_to_the_unit_of_length(demonstrations, selection):
-    """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square."""
-    larger = fit(Demonstrations(demonstrations.times, [100 * y for y in demonstrations.outputs]))
-    assert larger.components == selection.components
-    assert larger.length_scale == selection.length_scale
-    assert larger.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
-    np.testing.assert_allclose(
-        motion_without_actions(larger.primitive()), 100 * motion_without_actions(selection.primitive()), atol=1e-3
-    )
-
-
-def test_unit_of_time_scales_only_the_length_scale(demonstrations, selection):
-    slower = fit(Demonstrations([10 * t for t in demonstrations.times], demonstrations.outputs))
-    assert slower.components == selection.components
-    assert slower.length_scale == pytest.approx(10 * selection.length_scale, rel=1e-9)
-    assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
+def test_fit_is_invariant_to_units(demonstrations, selection):
+    """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square; time scales only the length scale."""
+    other = fit(Demonstrations([10 * t for t in demonstrations.times], [100 * y for y in demonstrations.outputs]))
+    assert other.components == selection.components
+    assert other.kernel.length_scale == pytest.approx(10 * selection.kernel.length_scale, rel=1e-9)
+    assert other.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
+    np.testing.assert_allclose(motion(other), 100 * motion(selection), atol=1e-3)
 
 
 def test_selection_accepts_arguments_of_the_primitive(selection):
     primitive = selection.primitive(history=3, history_variance=1e-5, lambda_=7.0)
-    assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.beta)
+    assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.lambda_)
     assert primitive.reference is selection.reference
-    assert share_within_spread(selection.primitive(history=3, history_variance=1e-6)) >= MIN_SHARE
 
 
 def hook(steps=60, deviation=0.05):
@@ -96,41 +95,25 @@ def hook(steps=60, deviation=0.05):
 
 def test_share_is_low_when_a_primitive_leaves_the_spread():
     """The share falls if the kernel cuts the corner, or if λ pulls the motion to zero."""
-    good = LcNsKmp(hook(), SquaredExponential(0.1), 0.05, 0.05)
-    assert share_within_spread(good) == 1.0
-    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(22.4), 6.0, 6.0, max_deviation=np.inf)
-    assert share_within_spread(too_wide) < 0.7
-    too_strong = LcNsKmp(hook(), SquaredExponential(0.1), 1e5, 1e5, max_deviation=np.inf)
-    assert share_within_spread(too_strong) < 0.2
-    for primitive in (good, too_wide, too_strong):
-        estimate = estimated_share(primitive.reference, primitive.kernel, primitive.lambda_, primitive.beta)
-        assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
+    for reference, length_scale, lambda_, low, high in (
+        (hook(), 0.1, 0.05, 1.0, 1.0),
+        (hook(deviation=0.005), 22.4, 6.0, 0.0, 0.7),
+        (hook(), 0.1, 1e5, 0.0, 0.2),
+    ):
+        share = share_within_spread(reference, SquaredExponential(length_scale), lambda_, lambda_, evaluated=LONG)
+        assert low <= share <= high
+        estimate = share_within_spread(reference, SquaredExponential(length_scale), lambda_, lambda_)
+        assert estimate == pytest.approx(share, abs=0.1)
 
 
 def test_share_considers_correlations():
     """With variances of 0.01 and a correlation of 0.99, one standard deviation is 0.141 along (1, 1), 0.01 across."""
     t = np.linspace(0, 1, 20)
-    covariance = 0.01 * np.array([[1.0, 0.99], [0.99, 1.0]])
-
-    class OffsetMotion(LcNsKmp):
-        def predict(self, step, null_space_action=None, history=None):
-            prediction = super().predict(step, null_space_action, history)
-            prediction.output = self.reference.means[step] + self.offset
-            return prediction
-
-    primitive = OffsetMotion(ReferenceTrajectory(t, np.zeros((20, 2)), np.tile(covariance, (20, 1, 1))))
+    covariances = np.tile(0.01 * np.array([[1.0, 0.99], [0.99, 1.0]]), (20, 1, 1))
     for offset, share in (((0.05, 0.05), 1.0), ((0.011, -0.011), 0.0), ((0.0995, 0.0995), 1.0), ((0.102, 0.102), 0.0)):
-        primitive.offset = np.array(offset)
-        assert share_within_spread(primitive) == share
-
-
-def test_motion_uses_earlier_commands_as_history():
-    reference = hook()
-    primitive = LcNsKmp(reference, history=2, history_variance=1e-4)
-    past = np.tile(reference.means[0], (2, 1))
-    for step, output in enumerate(motion_without_actions(primitive)):
-        np.testing.assert_array_equal(output, primitive.predict(step, None, past).output)
-        past = np.vstack([past[1:], output])
+        reference = ReferenceTrajectory(t, np.tile(offset, (20, 1)), covariances)
+        # This regularization is so strong that the motion stays at zero.
+        assert share_within_spread(reference, SquaredExponential(0.5), 1e8, 0.0) == share
 
 
 def test_information_criteria_stop_when_not_improving():
@@ -179,8 +162,8 @@ def test_long_recordings_are_thinned_out_before_the_mixture():
     np.testing.assert_allclose(long.reference.means[[0, -1]], short.reference.means[[0, -1]], atol=2e-3)
 
 
-@pytest.mark.parametrize("steps", [401, 1000, 5000])
-def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch):
+@pytest.mark.parametrize(("steps", "samples"), [(400, 400), (401, 150), (5000, 150)])
+def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, samples, monkeypatch):
     """The cost of expectation maximization is bounded by the number of samples that it sees."""
     sizes = []
     fitted = mixture._fit
@@ -190,10 +173,7 @@ def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch
         return fitted(data, *arguments)
 
     monkeypatch.setattr(mixture, "_fit", counted)
-    selection = fit(slow(steps), components=5, length_scale=4.0, lambda_=1.0)
-    assert max(sizes) == 3 * 150
+    selection = fit(slow(steps), components=5)
+    assert max(sizes) == 3 * samples
     assert selection.reference.num_steps == steps
-
-
-def test_recordings_of_usual_length_are_not_thinned_out():
-    assert "evenly spaced" not in fit(slow(400), components=5, length_scale=4.0, lambda_=1.0).why
+    assert ("evenly spaced" in selection.why) == (samples < steps)

@@ -15,58 +15,42 @@ def data(n=300, outputs=6, seed=0):
     return t, means, np.einsum("ni,ij,kj,nk->nik", width, mix, mix, width)
 
 
-def textbook(kernel, t, means, covariances, queries, lambda_, covariance_lambda):
+def textbook(kernel, t, means, covariances, queries, lambda_):
     """Compute equations 2.17 and 2.18 directly."""
     outputs = means.shape[1]
     eye = np.eye(outputs)
-    K = np.kron(kernel(t, t), eye)
-    sigma = np.zeros_like(K)
+    A = np.kron(kernel(t, t), eye)
     for i, block in enumerate(covariances):
-        sigma[i * outputs : (i + 1) * outputs, i * outputs : (i + 1) * outputs] = block
+        A[i * outputs : (i + 1) * outputs, i * outputs : (i + 1) * outputs] += lambda_ * block
     k = np.kron(kernel(queries, t), eye)
-    mean = (k @ np.linalg.solve(K + lambda_ * sigma, means.ravel())).reshape(len(queries), outputs)
-    reduced = np.kron(kernel(queries, queries), eye) - k @ np.linalg.solve(K + covariance_lambda * sigma, k.T)
-    blocks = reduced.reshape(len(queries), outputs, len(queries), outputs)
-    return mean, len(t) / covariance_lambda * np.einsum("noni->noi", blocks)
+    reduced = np.kron(kernel(queries, queries), eye) - k @ np.linalg.solve(A, k.T)
+    blocks = np.einsum("noni->noi", reduced.reshape(len(queries), outputs, len(queries), outputs))
+    return (k @ np.linalg.solve(A, means.ravel())).reshape(len(queries), outputs), len(t) / lambda_ * blocks
 
 
 @pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.7)])
-def test_mean_and_covariance_match_equations_2_17_and_2_18(kernel):
+@pytest.mark.parametrize("lambda_", [1.5, 20.0])
+def test_mean_and_covariance_match_equations_2_17_and_2_18(kernel, lambda_):
     t, means, covariances = data(80, 3)
     queries = np.linspace(-0.3, 8.3, 17)
-    mean, covariance = textbook(kernel, t, means, covariances, queries, 1.5, 20.0)
-    primitive = Kmp(t, means, covariances, kernel, lambda_=1.5, covariance_lambda=20.0)
+    mean, covariance = textbook(kernel, t, means, covariances, queries, lambda_)
+    primitive = Kmp(t, means, covariances, kernel, lambda_)
     np.testing.assert_allclose(primitive.mean(queries), mean, atol=1e-8)
     np.testing.assert_allclose(primitive.covariance(queries), covariance, rtol=1e-6, atol=1e-7)
 
 
-def test_via_points_equal_points_of_the_reference():
-    """Added, moved and removed via-points give the result of a new primitive with the same points."""
-    kernel = SquaredExponential(0.5)
+def test_motion_passes_through_via_points_and_the_original_does_not_change():
     t, means, covariances = data(60, 2)
-    queries = np.linspace(-0.5, 9.5, 23)
-    tight = 1e-6 * np.eye(2)
-    primitive = Kmp(t, means, covariances, kernel)
-
-    def expected(points):
-        inputs = np.append(t, [p[0] for p in points])
-        all_means = np.vstack([means, *[p[1] for p in points]])
-        return textbook(
-            kernel, inputs, all_means, np.concatenate([covariances, *[[tight]] * len(points)]), queries, 1, 1
-        )
-
-    a = primitive.add_via_point(3.3, [1.0, 0.5], tight)
-    b = primitive.add_via_point(9.0, [0.0, 0.0], tight)
-    mean, covariance = expected([(3.3, [1.0, 0.5]), (9.0, [0.0, 0.0])])
-    np.testing.assert_allclose(primitive.mean(queries), mean, atol=5e-6)
-    np.testing.assert_allclose(primitive.covariance(queries), covariance, atol=1e-6)
-    np.testing.assert_allclose(primitive.mean([3.3]), [[1.0, 0.5]], atol=5e-3)
-
-    primitive.move_via_point(a, 5.0, [0.2, 0.1], tight)
-    np.testing.assert_allclose(primitive.mean(queries), expected([(5.0, [0.2, 0.1]), (9.0, [0.0, 0.0])])[0], atol=5e-6)
-    primitive.remove_via_point(b)
-    primitive.remove_via_point(a)
-    np.testing.assert_allclose(primitive.mean(queries), expected([])[0], atol=1e-7)
+    kernel, queries, tight = SquaredExponential(0.5), np.linspace(-0.5, 9.5, 23), 1e-6 * np.eye(2)
+    original = Kmp(t, means, covariances, kernel)
+    before = original.mean(queries)
+    passing = original.through([3.3], [1.0, 0.5], tight).through([9.0], [0.0, 0.0], tight)
+    points = np.append(t, [3.3, 9.0]), np.vstack([means, [1.0, 0.5], [0.0, 0.0]]), [*covariances, tight, tight]
+    mean, covariance = textbook(kernel, *points, queries, 1.0)
+    np.testing.assert_allclose(passing.mean(queries), mean, atol=5e-6)
+    np.testing.assert_allclose(passing.covariance(queries), covariance, atol=1e-6)
+    np.testing.assert_allclose(passing.mean([3.3]), [[1.0, 0.5]], atol=5e-3)
+    np.testing.assert_array_equal(original.mean(queries), before)
 
 
 def test_kmp_accepts_a_state_as_input():
@@ -78,62 +62,38 @@ def test_kmp_accepts_a_state_as_input():
     inside = rng.uniform(-0.7, 0.7, (20, 2))
     expected = np.column_stack([inside[:, 0] * inside[:, 1], inside.sum(axis=1), np.cos(inside[:, 0])])
     np.testing.assert_allclose(primitive.mean(inside), expected, atol=0.02)
+    assert primitive.through([0.5, 0.5], np.zeros(3), 1e-8 * np.eye(3)).mean([[0.5, 0.5]]) == pytest.approx(
+        0.0, abs=0.01
+    )
 
 
 @pytest.mark.parametrize(
     ("via_point", "message"),
     [
-        ((np.nan, [0.0, 0.0], np.eye(2)), "finite"),
-        ((0.0, [0.0, np.inf], np.eye(2)), "finite"),
+        ((np.nan, [0.0, 0.0], np.eye(2)), "inputs must be finite"),
+        ((0.0, [0.0, np.inf], np.eye(2)), "means and covariances must be finite"),
         ((0.0, [0.0, 0.0], np.zeros((2, 2))), "positive definite"),
-        ((0.0, [0.0, 0.0], np.array([[1.0, 0.5], [0.0, 1.0]])), "not symmetric"),
+        ((0.0, [0.0, 0.0], np.array([[1.0, 0.5], [0.0, 1.0]])), "point 20 is not symmetric"),
     ],
 )
-def test_add_via_point_refuses_invalid_points(via_point, message):
-    primitive = Kmp(*data(20, 2))
-    before = primitive.mean([1.0])
+def test_points_that_are_not_finite_or_definite_are_refused(via_point, message):
     with pytest.raises(InputError, match=message):
-        primitive.add_via_point(*via_point)
-    np.testing.assert_array_equal(primitive.mean([1.0]), before)
+        Kmp(*data(20, 2)).through(*via_point)
 
 
-def test_kmp_refuses_unknown_via_points_and_invalid_arguments():
-    primitive = Kmp(*data(20, 2))
-    with pytest.raises(InputError, match="no via-point 7"):
-        primitive.remove_via_point(7)
-    with pytest.raises(InputError, match="lambda_"):
+def test_lambda_must_be_positive():
+    with pytest.raises(InputError, match="lambda_ must be positive"):
         Kmp(*data(20, 2), lambda_=0.0)
-    t, means, covariances = data(20, 2)
-    for arguments in (np.where(t == t[3], np.nan, t), means), (t, np.where(means == means[3], np.nan, means)):
-        with pytest.raises(InputError, match="finite"):
-            Kmp(*arguments, covariances)
-
-
-def test_via_point_input_must_be_finite():
-    x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
-    primitive = Kmp(x, x, np.tile(np.eye(2), (20, 1, 1)))
-    for via_input in ([np.nan, 0.0], [0.0, np.inf]):
-        with pytest.raises(InputError, match="finite"):
-            primitive.add_via_point(via_input, [0.0, 0.0], np.eye(2))
-
-
-def test_kmp_accepts_lists():
-    t, means, covariances = data(20, 2)
-    expected = Kmp(t, means, covariances).mean([1.0])
-    np.testing.assert_array_equal(Kmp(t.tolist(), means.tolist(), covariances.tolist()).mean([1.0]), expected)
 
 
 def test_kmp_copies_its_arguments():
-    t, means, covariances = data(60, 2)
-    expected = Kmp(t, means, covariances)
-    target, covariance = np.array([0.4, -0.3]), 1e-4 * np.eye(2)
-    arguments = t.copy(), means.copy(), covariances.copy()
-    changed = Kmp(*arguments)
+    arguments = data(60, 2)
+    expected, changed = Kmp(*arguments), Kmp(*arguments)
+    queries = arguments[0].copy()
     for array in arguments:
         array[:] = 1.0
-    expected.add_via_point([3.0], target.copy(), covariance.copy())
-    changed.add_via_point([3.0], target, covariance)
-    target[:], covariance[:] = 5.0, np.eye(2)
-    for primitive in (expected, changed):
-        primitive.add_via_point([20.0], [0.1, 0.2], 1e-4 * np.eye(2))  # far away: factored again
-    np.testing.assert_array_equal(changed.mean(t), expected.mean(t))
+    np.testing.assert_array_equal(
+        changed.through([3.0], [0.4, -0.3], np.eye(2)).mean(queries),
+        expected.through([3.0], [0.4, -0.3], np.eye(2)).mean(queries),
+    )
+    np.testing.assert_array_equal(changed.mean(queries), Kmp(*data(60, 2)).mean(queries))

@@ -1,7 +1,6 @@
 """LcNsKmp solves problem 4.5 and refuses invalid arguments."""
 
 import gc
-import tracemalloc
 import warnings
 from functools import cache
 from pathlib import Path
@@ -20,8 +19,7 @@ from guiderail.models.primitives import (
     SquaredExponential,
     pose_demonstrations,
 )
-from guiderail.models.primitives.deviation import MAX_DEVIATION, MAX_MISS, measure_deviation
-from guiderail.models.primitives.fit import motion_without_actions
+from guiderail.models.primitives.deviation import MAX_DEVIATION, MAX_MISS, measure_deviation, outputs_at
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 from oracles.dense import Extended
 from oracles.problems import Problem, random_problem
@@ -51,7 +49,7 @@ def kkt_residual(problem, prediction) -> float:
     return max(float((-slack).max()), float((-alpha).max()) / largest, float((alpha * slack).max()) / largest)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(15))
 def test_predict_solves_problem_4_5(seed):
     problem = random_problem(seed)
     prediction = problem.solve()
@@ -60,7 +58,7 @@ def test_predict_solves_problem_4_5(seed):
     np.testing.assert_allclose(prediction.output, prediction.trajectory[0], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_predict_is_at_least_as_accurate_as_dense_cholesky(seed):
     problem = random_problem(seed, history_variance=1e-8, history_noise=1e-3)
     prediction = problem.solve()
@@ -74,7 +72,7 @@ def test_predict_is_at_least_as_accurate_as_dense_cholesky(seed):
     assert error <= max(float((np.abs(in_doubles - exact) / scale_of(problem)).max()), 1e-12)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_predict_agrees_with_a_qp_over_kernel_weights(seed):
     """Solve problem 4.5 directly, over weights of the kernel's features, by an interior-point method.
 
@@ -125,7 +123,7 @@ def ring_loading() -> ReferenceTrajectory:
         demonstrations = pose_demonstrations(
             list(file["time"]), list(file["position"]), list(file["quaternion_wxyz"]), orientation="rotation_vector"
         )
-    return ReferenceTrajectory.from_demonstrations(demonstrations, components=10, num_steps=200)
+    return ReferenceTrajectory.from_demonstrations(demonstrations.resampled(200), components=10)
 
 
 def real_problem(history, seed) -> Problem:
@@ -158,18 +156,8 @@ def test_predict_solves_problem_4_5_on_real_demonstrations(history, seed):
     assert kkt_residual(problem, prediction) < 1e-8
 
 
-@pytest.mark.parametrize("solver", ["piqp", "osqp"])
-@pytest.mark.parametrize("seed", range(6))
-def test_solvers_agree(solver, seed):
-    problem = random_problem(seed)
-    primitive = LcNsKmp(**{**arguments_of(problem.primitive), "solver": solver})
-    prediction = primitive.predict(problem.step, problem.action, problem.history)
-    difference = (prediction.trajectory - problem.solve().trajectory) / scale_of(problem)
-    np.testing.assert_allclose(difference, 0, atol=1e-6)
-
-
 def arguments_of(p: LcNsKmp) -> dict:
-    names = "reference kernel lambda_ beta horizon history history_variance constraints solver"
+    names = "reference kernel lambda_ beta horizon history history_variance constraints"
     return {name: getattr(p, name) for name in names.split()}
 
 
@@ -222,10 +210,9 @@ def test_constraints_are_satisfied_after_a_violating_history():
     assert (prediction.trajectory[:, 0] <= 0.5 + 1e-9).all()
 
 
-@pytest.mark.parametrize("history", [0, 1, 10])
+@pytest.mark.parametrize(("history", "history_variance"), [(0, 1e-4), (1, 1e-10), (10, 1e-4), (10, 1e-10)])
 @pytest.mark.parametrize("period", [0.02, 0.001])
-@pytest.mark.parametrize("history_variance", [1e-4, 1e-10])
-def test_bounds_are_satisfied_under_extreme_actions(history, period, history_variance):
+def test_bounds_are_satisfied_under_extreme_actions(period, history, history_variance):
     """The actions in the closed loop are far larger than usual gains: constant, alternating and random."""
     t = period * np.arange(60)
     covariances = np.tile(np.diag([1e-6, 1e-2]), (60, 1, 1))
@@ -250,8 +237,7 @@ def test_bounds_are_satisfied_under_extreme_actions(history, period, history_var
 @pytest.mark.parametrize(
     "variances", [(1e-12, 1.0), (1.0, 1e-12), (1e-12, 1e-12), "alternating", "demonstrations that coincide"]
 )
-@pytest.mark.parametrize("period", [0.02, 0.001])
-@pytest.mark.parametrize("history", [0, 1, 10])
+@pytest.mark.parametrize(("period", "history"), [(0.02, 0), (0.001, 1), (0.001, 10)])
 def test_bounds_are_satisfied_in_badly_scaled_problems(variances, period, history):
     """Variances range from 1e-12 to 1, with ρ = 1e-10 and periods down to 1 ms."""
     t = period * np.arange(60)
@@ -344,53 +330,6 @@ def test_predict_accepts_any_kernel_and_an_uneven_clock():
     np.testing.assert_allclose(outputs, np.sin(t), atol=0.05)
 
 
-def test_predict_at_accepts_other_inputs():
-    """`predict_at` agrees with `predict` on the clock, and accepts inputs of any dimension."""
-    p = LcNsKmp(**small(history=2))
-    steps, past = np.arange(8, 17), p.reference.means[6:8]
-    args = p.reference.means[steps], p.reference.covariances[steps], np.ones(2) * 5, past
-    direct = p.predict_at(p.reference.times[steps], *args, p.reference.times[6:8])
-    clocked = p.predict(8, np.ones(2) * 5, past)
-    assert clocked.constrained
-    np.testing.assert_allclose(direct.trajectory, clocked.trajectory, rtol=0, atol=1e-10)
-    lists = [a.tolist() for a in (p.reference.times[steps], *args, p.reference.times[6:8])]
-    np.testing.assert_array_equal(p.predict_at(*lists).trajectory, direct.trajectory)
-    states = np.column_stack([np.cos(p.reference.times), np.sin(p.reference.times)])
-    output = p.predict_at(states[steps], *args, states[6:8]).output
-    assert p.constraints.violation(output) <= 1e-9
-    with pytest.raises(InputError, match="finite"):
-        p.predict_at(states[steps] * np.nan, *args, states[6:8])
-
-
-def test_cache_stays_within_its_limit():
-    p = LcNsKmp(**small(cache_bytes=20_000))
-    for n in list(range(20)) * 3:
-        p.predict(n)
-    assert p.cached_bytes <= 20_000
-    everything = LcNsKmp(**small())
-    assert everything.factor_all() == everything.cached_bytes > 20_000
-    expected = everything.predict(7).output
-    np.testing.assert_array_equal(p.predict(7).output, expected)
-
-
-def test_predict_does_not_leak_memory():
-    p = LcNsKmp(**small(history=3))
-    past = p.reference.means[:3]
-
-    def run(steps):
-        for k in range(steps):
-            p.predict(k % 20, np.ones(2) * (-1) ** k, past)
-
-    run(200)
-    tracemalloc.start()
-    run(500)
-    before, _ = tracemalloc.get_traced_memory()
-    run(2_500)
-    after, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert after - before < 2_000  # less than one byte per step
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -400,7 +339,6 @@ def test_predict_does_not_leak_memory():
         ({"history": 2, "history_variance": 0.0}, "history_variance"),
         ({"constraints": LinearConstraints(np.eye(3), np.zeros(3))}, "3 outputs"),
         ({"constraints": LinearConstraints(np.zeros((7, 1, 2)), np.zeros((7, 1)))}, "7 steps"),
-        ({"solver": "magic"}, "magic"),
         ({"kernel": "matern52"}, "a kernel is an object such as SquaredExponential"),
         ({"kernel": Matern52}, "a kernel is an object such as SquaredExponential"),
     ],
@@ -446,9 +384,10 @@ def test_deviation_from_demonstrations_depends_on_the_unit(unit):
             warnings.simplefilter("error")
             primitive = LcNsKmp(reference)
         assert primitive.deviation < 1.0
-        errors = (motion_without_actions(primitive) - means) / 0.01
         steps = np.unique(np.linspace(0, 59, 16).astype(int))
-        assert primitive.deviation == pytest.approx(np.sqrt((errors[steps] ** 2).mean()))
+        motion = np.array([primitive.predict(step).output for step in steps.tolist()])
+        assert primitive.deviation == pytest.approx(np.sqrt((((motion - means[steps]) / 0.01) ** 2).mean()))
+        np.testing.assert_allclose(outputs_at(reference, SquaredExponential(), 12.0, 40, steps), motion, atol=1e-9)
 
 
 @pytest.mark.parametrize("is_refused", [True, False])
@@ -507,7 +446,6 @@ def test_equal_arguments_share_a_primitive_in_use():
         lambda: get_shared_primitive(reference(), box(0.8), KERNEL, history=2),
         lambda: get_shared_primitive(reference(), box(), SquaredExponential(0.4), history=2),
         lambda: get_shared_primitive(reference(), box(), KERNEL, history=3),
-        lambda: get_shared_primitive(reference(), box(), KERNEL, history=2, solver="osqp"),
     ],
 )
 def test_different_arguments_make_another_primitive(get_primitive):

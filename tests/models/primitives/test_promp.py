@@ -1,12 +1,10 @@
-"""Probabilistic movement primitive: fit, conditioning on via-points, blending, and exploration in gaps."""
+"""Probabilistic movement primitive: fit, conditioning on via-points and blending."""
 
 import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations, LcNsKmp, ProMp, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.gains import authority_gains
-from guiderail.models.primitives.reference import unobserved_share
+from guiderail.models.primitives import Demonstrations, ProMp, ReferenceTrajectory
 
 T = np.linspace(0.0, 2.0, 100)
 PHASES = np.linspace(0.0, 1.0, 100)
@@ -76,20 +74,15 @@ def test_promp_refuses_too_many_basis_functions():
         ProMp.fit(Demonstrations([T, 2.0 * T], [T[:, None], T[:, None]]))
 
 
-def test_reference_from_promp_equals_reference_with_promp_model():
-    d = bundle()
-    direct = ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=[0.01, 0.02])
-    fitted = ReferenceTrajectory.from_demonstrations(d, model="promp", floor=[0.01, 0.02])
-    np.testing.assert_allclose(fitted.means, direct.means, atol=1e-12)
-    np.testing.assert_allclose(fitted.covariances, direct.covariances, atol=1e-12)
-    assert (fitted.standard_deviations >= [0.01, 0.02]).all()
-    single = ReferenceTrajectory.from_demonstrations(d.first(1), model="promp", prior_std=[0.1, 0.2])
-    np.testing.assert_allclose(single.standard_deviations, np.tile([0.1, 0.2], (100, 1)), rtol=1e-2)
-    with pytest.raises(InputError, match="gmr or promp"):
-        ReferenceTrajectory.from_demonstrations(d, model="dmp")
+def test_reference_from_promp_has_its_moments_and_a_floor():
+    promp = ProMp.fit(bundle())
+    means, covariances = promp.moments(PHASES)
+    reference = ReferenceTrajectory.from_promp(promp, T, floor=[0.01, 0.02])
+    np.testing.assert_allclose(reference.means, means, atol=1e-12)
+    np.testing.assert_allclose(reference.covariances, covariances + np.diag([1e-4, 4e-4]), atol=1e-12)
     for floor in (-0.01, [0.01, np.nan], [0.01] * 3):
         with pytest.raises(InputError, match="floor"):
-            ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=floor)
+            ReferenceTrajectory.from_promp(promp, T, floor=floor)
 
 
 def random_reference(scale, seed):
@@ -123,57 +116,3 @@ def test_blend_of_share_zero_and_one_is_exact():
             first.blended(second, share)
     with pytest.raises(InputError, match="same times"):
         first.blended(ReferenceTrajectory(2.0 * T, first.means, first.covariances), 0.5)
-
-
-def with_gap(first, last):
-    """Return the demonstrations stretched to 8 s, without the samples between two times [s]."""
-    is_recorded = (first >= 4.0 * T) | (last <= 4.0 * T)
-    return Demonstrations(4.0 * T[is_recorded], [y[is_recorded] for y in bundle().outputs])
-
-
-def test_unobserved_share_is_a_gaussian_process_posterior():
-    recordings = with_gap(3.0, 6.0)
-    reference = ReferenceTrajectory.from_demonstrations(recordings, 6, num_steps=100)
-    observed = (reference.times <= 3.0 + 1e-9) | (reference.times >= 6.0 - 1e-9)
-    k, at = SquaredExponential(0.5), reference.times
-    outputs = []
-    for output in range(2):
-        noise = np.diag(reference.covariances[observed, output, output])
-        cross_kernel = k(at, at[observed])
-        gain = np.linalg.solve(k(at[observed], at[observed]) + noise, cross_kernel.T).T
-        outputs.append(1.0 - np.einsum("nm,nm->n", cross_kernel, gain))
-    diagonal = ReferenceTrajectory(at, reference.means, reference.covariances * np.eye(2))
-    np.testing.assert_allclose(unobserved_share(diagonal, recordings, k), np.stack(outputs, axis=1), atol=1e-6)
-    share = unobserved_share(reference, recordings)
-    assert share[at < 2.5].max() < 0.05
-    assert share[np.abs(at - 4.5) < 0.2].min() > 0.9
-
-
-@pytest.mark.parametrize("scale", [0.1, 3.0])
-def test_exploration_in_a_gap_is_scaled(scale):
-    """The displacement by an action is scaled by about `scale` in the gap, and is equal elsewhere."""
-    recordings = with_gap(3.0, 6.0)
-    plain = ReferenceTrajectory.from_demonstrations(recordings, 6, num_steps=100)
-    scaled = ReferenceTrajectory.from_demonstrations(recordings, 6, num_steps=100, gap_scale=scale)
-    np.testing.assert_array_equal(scaled.means, plain.means)
-    ratio = scaled.standard_deviations / plain.standard_deviations
-    np.testing.assert_allclose(ratio[plain.times < 2.5], 1.0, atol=0.1)
-    np.testing.assert_allclose(ratio[np.abs(plain.times - 4.5) < 0.1], scale, rtol=0.25)
-    primitives = [LcNsKmp(reference, horizon=10) for reference in (plain, scaled)]
-    gain = authority_gains(primitives[0])
-
-    def reach(primitive, step):
-        return np.linalg.norm(primitive.predict(step, gain).output - primitive.predict(step).output)
-
-    ratio_in_gap = reach(primitives[1], 56) / reach(primitives[0], 56)
-    assert ratio_in_gap < 0.4 if scale < 1.0 else ratio_in_gap > 1.5
-    assert reach(primitives[1], 10) == pytest.approx(reach(primitives[0], 10), rel=0.1)
-    with pytest.raises(InputError, match="gap_scale"):
-        ReferenceTrajectory.from_demonstrations(recordings, 6, gap_scale=0.0)
-
-
-def test_recordings_without_a_gap_are_not_scaled():
-    d = bundle()
-    plain = ReferenceTrajectory.from_demonstrations(d, 6)
-    scaled = ReferenceTrajectory.from_demonstrations(d, 6, gap_scale=0.01)
-    np.testing.assert_allclose(scaled.standard_deviations, plain.standard_deviations, rtol=0.1)

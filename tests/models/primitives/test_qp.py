@@ -1,19 +1,15 @@
-"""Every solver satisfies the KKT conditions of the quadratic program or raises an error."""
-
-import sys
+"""Solutions satisfy the KKT conditions of the quadratic program."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import UnsolvableError
-from guiderail.models.primitives.qp import SOLVERS, _identity, find_solver, solve_least_norm
+from guiderail.models.primitives.qp import _identity, solve_least_norm
 
-# Largest violation of a bound, and distance of v from the optimum, relative to the problem's size.
-VIOLATION = {"daqp": 1e-12, "piqp": 1e-11, "osqp": 2e-9}
-DISTANCE = {"daqp": 1e-10, "piqp": 1e-8, "osqp": 1e-6}
+VIOLATION = 1e-12  # largest violation of a bound, relative to the problem's size
+DISTANCE = 1e-10  # largest distance of v from the optimum, relative to the problem's size
 
 
 @st.composite
@@ -36,14 +32,13 @@ def problems(draw):
     return A, scale * lower, scale * upper
 
 
-@pytest.mark.parametrize("name", SOLVERS)
 @given(problem=problems())
-def test_solution_satisfies_the_kkt_conditions(name, problem):
+def test_solution_satisfies_the_kkt_conditions(problem):
     A, lower, upper = problem
     size = max(lower.max(), -upper.min())
-    v, multipliers = solve_least_norm(A, lower, upper, SOLVERS[name])
-    assert np.maximum(lower - A @ v, A @ v - upper).max() <= VIOLATION[name] * size
-    tolerance = 10 * DISTANCE[name] * max(size, np.linalg.norm(v))
+    v, multipliers = solve_least_norm(A, lower, upper)
+    assert np.maximum(lower - A @ v, A @ v - upper).max() <= VIOLATION * size
+    tolerance = 10 * DISTANCE * max(size, np.linalg.norm(v))
     # Stationarity is v = −Aᵀ multipliers. Multipliers are negative only at lower and positive only at upper bounds.
     np.testing.assert_allclose(v, -A.T @ multipliers, rtol=0, atol=100 * tolerance)
     pushes_up = multipliers < -100 * tolerance
@@ -53,18 +48,16 @@ def test_solution_satisfies_the_kkt_conditions(name, problem):
     assert pushes_up.any() or pushes_down.any() or np.linalg.norm(v) <= 1e4 * tolerance
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-def test_single_bound_is_met_by_the_shortest_correction(name):
+def test_single_bound_is_met_by_the_shortest_correction():
     row = np.array([[0.6, 0.8]])
     for lower, upper, expected in ((2.0, np.inf, 2.0), (-np.inf, -3.0, -3.0), (2.0, 2.5, 2.0), (-9.0, -3.0, -3.0)):
-        v, multipliers = solve_least_norm(row, np.array([lower]), np.array([upper]), SOLVERS[name])
+        v, multipliers = solve_least_norm(row, np.array([lower]), np.array([upper]))
         np.testing.assert_allclose(v, expected * row[0], atol=1e-6)
         np.testing.assert_allclose(multipliers, [-expected], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
 @given(seed=st.integers(0, 2**32 - 1), gap=st.sampled_from([1e-3, 0.1, 10.0]))
-def test_infeasible_problem_raises_unsolvable_error(name, seed, gap):
+def test_infeasible_problem_raises_unsolvable_error(seed, gap):
     rng = np.random.default_rng(seed)
     row = rng.standard_normal(4)
     row /= np.linalg.norm(row)
@@ -75,12 +68,11 @@ def test_infeasible_problem_raises_unsolvable_error(name, seed, gap):
         A = np.column_stack([np.cos(angles), np.sin(angles)])
         lower, upper = np.full(3, gap), np.full(3, np.inf)
     with pytest.raises(UnsolvableError, match="ended with"):
-        solve_least_norm(A, lower, upper, SOLVERS[name])
+        solve_least_norm(A, lower, upper)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_print_nothing(name, capfd):
-    solve_least_norm(np.eye(3), np.ones(3), np.full(3, 2.0), SOLVERS[name])
+def test_solver_prints_nothing(capfd):
+    solve_least_norm(np.eye(3), np.ones(3), np.full(3, 2.0))
     assert capfd.readouterr() == ("", "")
 
 
@@ -91,14 +83,6 @@ def test_daqp_solves_a_degenerate_problem_of_many_bounds():
     v, _ = solve_least_norm(A, np.ones(1000), np.full(1000, np.inf))
     assert (A @ v >= 1 - 1e-12).all()
     assert np.linalg.norm(v) <= 1 + 1e-8
-
-
-def test_find_solver_refuses_missing_solvers(monkeypatch):
-    with pytest.raises(InputError, match="choose one of daqp, piqp, osqp"):
-        find_solver("magic")
-    monkeypatch.setitem(sys.modules, "piqp", None)
-    with pytest.raises(InputError, match="not installed"):
-        solve_least_norm(np.eye(1), np.ones(1), np.full(1, 2.0), SOLVERS["piqp"])
 
 
 def test_identity_matrix_is_cached_for_each_size(monkeypatch):

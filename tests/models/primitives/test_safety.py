@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import (
     LcNsKmp,
     LinearConstraints,
@@ -14,7 +13,9 @@ from guiderail.models.primitives import (
     SquaredExponential,
     UnsolvableError,
 )
-from guiderail.models.primitives.qp import SOLVERS
+from guiderail.models.primitives import window as window_module
+from guiderail.models.primitives.features import window_features
+from guiderail.models.primitives.window import StepFactor, Window
 from oracles.problems import random_problem
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -28,50 +29,44 @@ def primitive(constraints, steps=30, deviation=0.1, **changes):
 
 
 UNIT_BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
+SOLVE = window_module.solve_least_norm
 
 
 @given(st.floats(0, 1) | st.sampled_from([0.5, 1 - 1e-6, 1 - 1e-8, 1 - 5e-9]), SEEDS)
 def test_command_outside_the_constraints_is_refused(share, seed):
     """A command is refused if the solver returns only a share of the correction."""
-
-    def solve_partially(rows, lower, upper):
-        v, multipliers = SOLVERS["daqp"](rows, lower, upper)
-        return share * v, multipliers
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(SOLVERS, "partial", solve_partially)
-        p = primitive(UNIT_BOX, solver="partial")
-    rng = np.random.default_rng(seed)
+    p, rng = primitive(UNIT_BOX), np.random.default_rng(seed)
     action = 1e4 * rng.uniform(0.5, 1, 2) * rng.choice([-1, 1], 2)
-    unconstrained = primitive(None).predict(3, action).output
-    violation = (1 - share) * (np.abs(unconstrained).max() - 1)
-    if violation > 1e-8:
-        with pytest.raises(UnsolvableError, match="violation"):
-            p.predict(3, action)
-    else:
-        try:
-            output = p.predict(3, action).output
-        except UnsolvableError:
-            assert violation > 1e-10
+    violation = (1 - share) * (np.abs(primitive(None).predict(3, action).output).max() - 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            window_module, "solve_least_norm", lambda *problem: (share * SOLVE(*problem)[0], SOLVE(*problem)[1])
+        )
+        if violation > 1e-8:
+            with pytest.raises(UnsolvableError, match="violation"):
+                p.predict(3, action)
         else:
-            assert UNIT_BOX.violation(output) <= 1e-9
+            try:
+                output = p.predict(3, action).output
+            except UnsolvableError:
+                assert violation > 1e-10
+            else:
+                assert UNIT_BOX.violation(output) <= 1e-9
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_command_that_is_not_finite_is_refused(monkeypatch, value):
     solve = lambda rows, lower, upper: (np.full(rows.shape[1], value), np.zeros(len(rows)))  # noqa: E731
-    monkeypatch.setitem(SOLVERS, "not finite", solve)
-    p = primitive(UNIT_BOX, solver="not finite")
+    monkeypatch.setattr(window_module, "solve_least_norm", solve)
     with pytest.raises(UnsolvableError), np.errstate(invalid="ignore"):
-        p.predict(3, np.array([1e5, 0.0]))
+        primitive(UNIT_BOX).predict(3, np.array([1e5, 0.0]))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_infeasible_window_raises_unsolvable_error(solver):
+def test_infeasible_window_raises_unsolvable_error():
     """Constraints that demand a jump between two steps are infeasible for a smooth kernel."""
     lower, upper = np.full((30, 2), -1e3), np.full((30, 2), 1e3)
     lower[11], upper[12] = 500.0, -500.0
-    p = primitive(LinearConstraints.box(lower, upper), kernel=SquaredExponential(np.sqrt(5e4)), solver=solver)
+    p = primitive(LinearConstraints.box(lower, upper), kernel=SquaredExponential(np.sqrt(5e4)))
     with pytest.raises(UnsolvableError):
         p.predict(8, np.zeros(2))
     assert np.abs(p.predict(0, np.zeros(2)).output).max() < 1e-9
@@ -174,72 +169,6 @@ def test_window_at_the_end_extrapolates_the_clock():
     assert p.predict(0, np.array([1e4, 0.0])).output[0] == pytest.approx(1.0, abs=1e-9)
 
 
-def test_features_differ_per_window_on_an_uneven_clock():
-    """With an uneven clock or a nonstationary kernel, every window has its own features."""
-    t = np.cumsum(np.linspace(0.01, 0.1, 30))
-    means = np.column_stack([np.sin(t), np.cos(t)])
-    reference = ReferenceTrajectory(t, means, np.tile(1e-4 * np.eye(2), (30, 1, 1)))
-    assert not reference.uniform
-    p = LcNsKmp(reference, horizon=5)
-    in_order = [p.predict(n).output for n in (0, 20)]
-    reordered = LcNsKmp(reference, horizon=5)
-    np.testing.assert_array_equal([reordered.predict(n).output for n in (20, 0)][::-1], in_order)
-    direct = p.predict_at(t[20:26], means[20:26], reference.covariances[20:26]).output
-    np.testing.assert_allclose(in_order[1], direct, rtol=0, atol=1e-12)
-
-
-class NonstationaryKernel(SquaredExponential):
-    """Squared-exponential kernel, scaled by its inputs."""
-
-    stationary = False
-
-    def __call__(self, a, b):
-        return super().__call__(a, b) * np.multiply.outer(1 + a, 1 + b)
-
-
-def test_features_differ_per_window_for_nonstationary_kernels():
-    t = 0.02 * np.arange(30)
-    means = np.column_stack([np.sin(t), np.cos(t)])
-    reference = ReferenceTrajectory(t, means, np.tile(1e-2 * np.eye(2), (30, 1, 1)))
-    p = LcNsKmp(reference, NonstationaryKernel(2.0), horizon=5)
-    p.predict(0)
-    direct = p.predict_at(t[20:26], means[20:26], reference.covariances[20:26]).output
-    np.testing.assert_allclose(p.predict(20).output, direct, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.5)])
-def test_history_inputs_are_on_the_clock(kernel):
-    """The result equals that of `predict_at` with the times of the history as inputs."""
-    t = 0.1 * np.arange(12)
-    means = np.column_stack([np.sin(t), np.cos(t)])
-    covariances = np.tile(1e-2 * np.eye(2), (12, 1, 1))
-    p = LcNsKmp(ReferenceTrajectory(t, means, covariances), kernel, horizon=4, history=3, history_variance=1e-4)
-    past = means[4:7] + 0.05
-    direct = p.predict_at(t[7:12], means[7:12], covariances[7:12], np.ones(2), past, t[4:7])
-    prediction = p.predict(7, np.ones(2), past)
-    np.testing.assert_allclose(prediction.output, direct.output, rtol=0, atol=1e-12)
-    # Before the first step the clock is extrapolated.
-    early = p.predict(1, np.ones(2), past).output
-    direct = p.predict_at(t[1:6], means[1:6], covariances[1:6], np.ones(2), past, np.array([-0.2, -0.1, 0.0])).output
-    np.testing.assert_allclose(early, direct, rtol=0, atol=1e-12)
-
-
-def test_predict_at_refuses_invalid_arguments():
-    p = primitive(UNIT_BOX)
-    t, means, covariances = np.linspace(0, 1, 4), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1))
-    p.predict_at(t, means, covariances)
-    for inputs, m, s, message in (
-        (t, means, covariances * np.nan, "finite"),
-        (t, means + np.inf, covariances, "finite"),
-        (t * np.nan, means, covariances, "finite"),
-    ):
-        with pytest.raises(InputError, match=message):
-            p.predict_at(inputs, m, s)
-    stepwise = primitive(LinearConstraints.box(np.full((30, 2), -1.0), np.full((30, 2), 1.0)))
-    with pytest.raises(InputError, match="need a clock"):
-        stepwise.predict_at(t, means, covariances)
-
-
 def test_linear_response_equals_the_unconstrained_prediction():
     p = primitive(LinearConstraints.box([-1e3, -1e3], [1e3, 1e3]), history=3, history_variance=1e-4)
     rng = np.random.default_rng(0)
@@ -251,24 +180,51 @@ def test_linear_response_equals_the_unconstrained_prediction():
         np.testing.assert_allclose(p.predict(step, action, past).output, expected, rtol=0, atol=1e-13)
 
 
-def test_cache_counts_bytes_and_drops_the_oldest():
+class NonstationaryKernel(SquaredExponential):
+    """Squared-exponential kernel, scaled by its inputs."""
+
+    stationary = False
+
+    def __call__(self, a, b):
+        return super().__call__(a, b) * np.multiply.outer(1 + a, 1 + b)
+
+
+@pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.5), NonstationaryKernel(2.0)])
+@pytest.mark.parametrize("is_uniform", [True, False])
+@pytest.mark.parametrize("history", [0, 3])
+def test_features_are_those_of_the_inputs_of_each_window(kernel, is_uniform, history):
+    """Before the first step the clock is extrapolated; only a uniform clock and a stationary kernel share features."""
+    t = 0.1 * np.arange(12) if is_uniform else np.cumsum(np.linspace(0.05, 0.2, 12))
+    means = np.column_stack([np.sin(t), np.cos(t)])
+    reference = ReferenceTrajectory(t, means, np.tile(1e-2 * np.eye(2), (12, 1, 1)))
+    assert reference.uniform == is_uniform
+    p = LcNsKmp(reference, kernel, horizon=4, history=history, history_variance=1e-4)
+    past, action = means[4 : 4 + history] + 0.05, np.ones(2)
+    for step in (1, 7):
+        at = np.arange(step, step + 5)
+        before = reference.inputs(np.arange(step - history, step))
+        features = window_features(kernel, before, reference.inputs(at), 12.0 * 1e-4)
+        window = Window(means[at], reference.covariances[at], np.zeros((5, 0, 2)), np.zeros((5, 0)))
+        factor = StepFactor(window, features, p.lambda_, p.beta)
+        expected = factor.output_map @ np.concatenate([past.ravel(), action]) + factor.output_offset
+        found = p.predict(step, action, past if history else None).output
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_cache_counts_bytes_and_drops_the_oldest(monkeypatch):
     unlimited = primitive(None)
-    unlimited.predict(0)
-    size = unlimited.cached_bytes
-    factor = unlimited._cache[0]
+    expected = unlimited.predict(0).output
+    size, factor = unlimited.cached_bytes, unlimited._cache[0]
     names = "output_map output_offset constraint_map lower upper constraint_rows correction_map"
     arrays = [getattr(factor, name) for name in names.split()] + [factor._window.means, factor._window.covariances]
     assert size >= sum(array.nbytes for array in arrays)
     unlimited.predict(0)
     assert unlimited.cached_bytes == size
-    p = primitive(None, cache_bytes=3 * size)
-    for n in range(10):
-        p.predict(n)
-        assert p.cached_bytes <= 3 * size
-    assert list(p._cache) == [7, 8, 9]
-    assert p.cached_bytes == 3 * size
-    tiny = primitive(None, cache_bytes=1)
-    tiny.predict(0)
-    tiny.predict(1)
-    assert list(tiny._cache) == [1]
     assert unlimited.factor_all() == 30 * size
+    for limit, kept in ((3 * size, [7, 8, 9]), (1, [9])):
+        monkeypatch.setattr("guiderail.models.primitives.lc_ns_kmp._CACHE_BYTES", limit)
+        p = primitive(None)
+        for n in range(10):
+            p.predict(n)
+        assert list(p._cache) == kept
+        np.testing.assert_array_equal(p.predict(0).output, expected)

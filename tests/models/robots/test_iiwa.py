@@ -6,8 +6,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.models.common.parsing import add_models
 from guiderail.models.control.wrench import external_wrench
-from guiderail.models.robots.end_effectors import CONNECTOR_TOOL
-from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.catalog import CONNECTOR_TOOL, IIWA14
 from guiderail.models.robots.mounting import add_end_effector, add_robot
 
 

@@ -1,4 +1,4 @@
-"""Joint range: joint positions of a commanded pose, linearized limits, and singular values."""
+"""Joint range: joint positions of a commanded pose, and linearized limits."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,8 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.robots.joint_range import JointRange
@@ -16,7 +15,6 @@ from guiderail.systems.support.drake_multibody import pose_to_transform
 
 POSE = np.array([0.02, 0.03, 0.1, 0.7, 0.1, -0.2])
 MARGIN = 0.1  # [rad]
-MIN_SINGULAR_VALUE = 0.05  # [m]
 
 
 @pytest.fixture(scope="module")
@@ -77,29 +75,10 @@ def tool_motion_part(model, q, change):
     return np.linalg.pinv(J) @ J @ change
 
 
-def test_gradient_of_the_singular_value_is_accurate(model):
-    joints = make_joint_range(model, min_singular_value=MIN_SINGULAR_VALUE)
-    q = joints.solve(POSE)
-    value, gradient = joints._singular_value(q)
-    step = 1e-5 * np.array([1.0, -2.0, 1.0, 0.5, -1.0, 1.0, 2.0])
-    assert joints._singular_value(q + step)[0] - value == pytest.approx(gradient @ step, rel=1e-2)
-    assert len(joints.linearize(POSE)[0]) == 15
-    assert joints.violation(POSE) == max(make_joint_range(model).violation(POSE), (MIN_SINGULAR_VALUE - value) / LEVER)
-
-
-def test_violation_of_the_singular_value_is_an_angle(model):
-    joints = make_joint_range(model)
-    value = joints._singular_value(joints.solve(POSE))[0]
-    for excess in (-0.001, 0.001):  # [m]
-        constrained = make_joint_range(model, min_singular_value=value + excess)
-        assert constrained.violation(POSE) == pytest.approx(excess / LEVER)
-
-
-@pytest.mark.parametrize("direction", [[0.6, 0.0, 0.0, 0.0, 0.0, 0.0], [-0.45, 0.0, -0.3, 0.0, 0.0, 0.0]])
-def test_commands_do_not_move_a_joint_beyond_its_limits(model, direction):
-    joints = make_joint_range(model, margin=MARGIN, min_singular_value=MIN_SINGULAR_VALUE)
+def test_commands_do_not_move_a_joint_beyond_its_limits(model):
+    joints = make_joint_range(model, margin=MARGIN)
     motion = MotionConstraints(LinearConstraints.none(6), max_speed=[2.0, 2.0, 2.0, 6.0, 6.0, 6.0], state=[joints])
-    motion_filter, desired = MotionConstraintFilter(motion, 0.02), POSE + np.array(direction)
+    motion_filter, desired = MotionConstraintFilter(motion, 0.02), POSE + [-0.45, 0.0, -0.3, 0.0, 0.0, 0.0]
     assert joints.violation(desired) > 0.0
     state, violations = motion_filter.start(POSE), []
     for _ in range(15):
@@ -114,15 +93,9 @@ def test_commands_do_not_move_a_joint_beyond_its_limits(model, direction):
     assert joints.violation(state[:6]) > 0.0
 
 
-def test_joint_range_refuses_invalid_arguments(model):
-    for arguments in ({"margin": -0.1}, {"min_singular_value": np.nan}, {"margin": 3.0}):
-        with pytest.raises(InputError):
-            make_joint_range(model, **arguments)
-
-
-def test_min_singular_value_requires_a_joint_margin():
-    with pytest.raises(InputError, match="joint_margin=0 as well"):
-        make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", min_singular_value=0.05)
+def test_posture_must_be_within_the_margin(model):
+    with pytest.raises(InputError, match="posture is not within the joint limits"):
+        make_joint_range(model, margin=3.0)
 
 
 def test_joint_margin_requires_an_arm():

@@ -13,7 +13,7 @@ from guiderail.models.templates import SharedControlTemplate, TemplateState, Tra
 from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates import mappings as im
 from guiderail.models.templates import transitions as td
-from guiderail.models.templates.geometry import angle_between, between
+from guiderail.models.templates.parts import angle_between, between
 
 SEEDS = st.integers(0, 2**32 - 1)
 PERIOD = 0.02

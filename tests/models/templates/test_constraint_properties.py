@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import active_constraints as ac
-from guiderail.models.templates.geometry import WORLD, angle_between, position_in
+from guiderail.models.templates.parts import WORLD, angle_between, position_in
 
 F = "object"
 SEEDS = st.integers(0, 2**32 - 1)

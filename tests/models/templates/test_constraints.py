@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform
 from guiderail.models.templates import active_constraints as ac
-from guiderail.models.templates.geometry import angle_between, largest
+from guiderail.models.templates.parts import angle_between, largest
 
 F = "object"
 CONSTRAINTS = [

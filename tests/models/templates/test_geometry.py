@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, axis_angle_rotation
-from guiderail.models.templates import geometry as g
+from guiderail.models.templates import parts as g
 
 SEEDS = st.integers(0, 2**32 - 1)
 ANGLES = st.floats(-math.pi, math.pi)

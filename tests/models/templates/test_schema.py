@@ -12,7 +12,7 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.active_constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.drawing import state_lines
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, TRANSITION_DISTANCES, register
+from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, TRANSITION_DISTANCES, register
 from guiderail.models.templates.transitions import TransitionDistance
 
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()

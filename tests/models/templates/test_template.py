@@ -11,7 +11,7 @@ from guiderail.models.templates import Command, SharedControlTemplate, TemplateS
 from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates import mappings as im
 from guiderail.models.templates import transitions as td
-from guiderail.models.templates.geometry import angle_between
+from guiderail.models.templates.parts import angle_between
 
 PERIOD = 0.01
 MUG = {"mug_tip": RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.7, 0.1, 0.1])}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RotationMatrix
 
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
 from research.action_fuzzing.bnc_connector import interference, slot_path
 
 MM = 1e-3

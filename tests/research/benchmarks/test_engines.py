@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.tasks.contact_probe import probe_contact
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
 from research.benchmarks import engines
 from research.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever
 

@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import WrenchSensor
 from research.benchmarks import simulation
 from research.benchmarks.simulation import CALLBACKS, real_time_factor, scripted_motion, timed_callbacks
 

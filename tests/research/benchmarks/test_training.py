@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import WrenchSensor
 from research.benchmarks.training import PARTS, REST, Profiler, measure, timed_parts
 
 

@@ -7,7 +7,19 @@ import pytest
 from guiderail.tools.tables import read_table
 from research.figures.thesis import THESIS
 from research.reproduction.knowledge import count_knowledge
-from research.reproduction.report import BEGIN, END, HOLDS, PAGE, ROOT, avoided_at, converged_at, entries, format_report
+from research.reproduction.report import (
+    BEGIN,
+    DETAILS,
+    END,
+    HOLDS,
+    PAGE,
+    ROOT,
+    avoided_at,
+    converged_at,
+    entries,
+    format_details,
+    format_verdicts,
+)
 from research.reproduction.tables import TABLES, load
 
 
@@ -32,7 +44,8 @@ def test_report_names_stored_files_only(report):
 
 def test_page_has_the_report_of_the_stored_tables(report):
     text = PAGE.read_text("utf-8")
-    assert text.partition(BEGIN)[2].partition(END)[0].strip() == format_report(report).strip()
+    assert text.partition(BEGIN)[2].partition(END)[0].strip() == format_verdicts(report).strip()
+    assert DETAILS.read_text("utf-8") == format_details(report)
 
 
 def test_open_figures_count_the_runs_that_have_ended(report):

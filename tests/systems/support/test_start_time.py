@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail import systems
-from guiderail.models.control.command_filters import BarrierFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import BarrierFilter, KeepOut
 from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
 from oracles.systems import check_start_time

@@ -12,11 +12,11 @@ import typer
 import guiderail
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import SIBLINGS
+from guiderail.models.common.registry import SIBLINGS
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.tools.cli import main as main_module
 from guiderail.tools.cli.app import to_json
-from guiderail.tools.cli.main import COMMANDS, load_commands, main
+from guiderail.tools.cli.main import COMMANDS, load_commands
 from guiderail.tools.environments import as_value
 from guiderail.tools.learning.run_folder import RunFolder
 from oracles.commands import call
@@ -34,12 +34,10 @@ CONNECTOR = str(study_path("connector"))
         (["train", "--out", "new"], "name a task"),
         (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
-        (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, "),
         (["train", "Bead", "--out", "new", "--algorithm", "dqn"], "sac, td3, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "tqc_contct"], "did you mean tqc_contact?"),
         (["train", "Bead", "--out", "new", "--fixture-offset", "per_episode"], "no option 'fixture_offset'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
-        (["train", "Bead", "--out", "new", "--episodes", "1000000001"], "at most 1000000000 episodes"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
         (["train", "Bead", "--out", "new", "--evaluate", "0"], "give at least 1, not 0"),
         (["train", "Bead", "--out", "new", "--station", "hardware"], "use guiderail train-on-robot TASK --out RUN"),
@@ -47,14 +45,10 @@ CONNECTOR = str(study_path("connector"))
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),
         (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "did you mean batch_size?"),
         (["train", "Bead", "--out", "new", "--set", "batch_size=0"], "greater than or equal to 1"),
-        (["train", "Bead", "--out", "new", "--set", "learning_rate=fast"], "give a value such as"),
         (["train", "--resume", "--out", "new"], "not a run"),
-        (["train", "Bead", "--fast"], "no option --fast"),
         (["train", "Bead", "--epsiodes", "3"], "did you mean --episodes?"),
-        (["train", "Bead", "--with-person"], "no option --with-person"),
         (["train", "Bead", "--out", "new", "--env", "action_repeat"], "--env takes name=value"),
         (["train", "Bead", "--out", "new", "--env", "action_repaet=2"], "did you mean action_repeat?"),
-        (["train", "Bead", "--out", "new", "--env", "wall=1", "--env", "wall=2"], "wall is given as 1 and as 2"),
         (
             ["train", "Bead", "--out", "new", "--guidance", "kmp", "--env", "guidance=skgrl"],
             "given as kmp and as skgrl",
@@ -63,53 +57,31 @@ CONNECTOR = str(study_path("connector"))
             ["train", "Bead", "--out", "new", "--num-envs", "2", "--set", "num_envs=1"],
             "num_envs is given as 1 and as 2",
         ),
-        (["train", "Bead", "--out", "new", "--set", "tau=1", "--set", "tau=0.5"], "tau is given as 1 and as 0.5"),
-        (["train", "Bead", "--out", "new", "--env", "action_repeat=two"], "give a value such as 1"),
-        (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
         (["train", "BncConnector", "--out", "new", "--robot", "panda"], "give --env robot=panda"),
         (["evaluate", "new"], "not a run"),
         (["visualize", "new", "--guidance", "kgrl"], "there is no option --guidance here: give --env guidance=kgrl"),
-        (["robustness", "new", "--station=arm"], "give --env station=arm"),
-        (["certify", "new", "--reward"], "give --env reward=VALUE"),
-        (["visualize", "new", "--action-repeat", "5"], "give --env action_repeat=5"),
         (["evaluate", "new", "--station", "hardware"], "use guiderail deploy RUN --episodes N"),
-        (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
         (["evaluate", "mypol.py", "--task", "Bead"], "mypol.py:FUNCTION"),
         (["evaluate", "nomod:zero", "--task", "Bead"], "to import for nomod:zero: give MODULE:FUNCTION or FILE.py"),
-        (["evaluate", "Bead", "--policy", "scripted"], "Bead has no policy 'scripted'"),
         (["evaluate", "Bead"], "Bead is a task: name the policy that acts in it"),
         (["evaluate", "NarrowPassage", "--policy", "scripted"], "'scripted' does not fit the observations"),
         (["visualize", "NarrowPassage"], "'scripted' does not fit the observations"),
         (["evaluate", ".", "--policy", "zero"], "name the task instead of a folder"),
         (["evaluate", "new", "--save", "x.yaml"], "demonstrations are .npz or .csv"),
-        (["visualize", "new"], "not a run"),
-        (["visualize", "new", "--image", "picture.png"], "not a run"),
         (["visualize", "Bead", "--policy", "scripte", "--image", "picture.png"], "no policy 'scripte'"),
         (["visualize", "Bead", "--policy", "zero", "--image", "picture.gif"], "a picture is .png"),
         (["visualize", "Bead", "--policy", "zero", "--image", "picture.png", "--episodes", "2"], "add --html"),
         (["visualize", "Bead", "--policy", "zero", "--video", "video.png"], "a video is .webp, .gif"),
         (["replay", "new"], "there is no command replay"),
         (["dataset"], "guiderail dataset needs a command: choose one of"),
-        (["dataset", "exprot", "a.npz"], "did you mean export?"),
         (["dataset", "validate", "new.npz"], "no file"),
-        (["dataset", "validate", "."], "no file .npz or .csv"),
-        (["dataset", "validate", "new.yaml"], "there is no file new.yaml"),
         (["dataset", "fit-bounds", "new.npz", "--outputs", "x"], "whole numbers separated by commas"),
         (["dataset", "import", "new.csv", "--out", "new.npz", "--target", "1_0,0,0,0,0,0"], "takes 6 numbers"),
         (["template", "validate", "pouring", "--import", "new.py"], "no module, file or task folder new.py to import"),
         (["deploy", "new", "--import", "new.py"], "no module, file or task folder new.py to import"),
         (["template", "validate", "pourin"], "or one of end_effector_velocity, grid_clamp, pouring"),
-        (["template", "validate", "."], "a template is .yaml"),
         (["study", "connector.yaml", "--out", "new"], "there is no file connector.yaml"),
         (["study", CONNECTOR, "--out", "new", "--seeds", "1;2"], "whole numbers separated by commas"),
-        (["study", CONNECTOR, "--out", "new", "--seeds", "1_0"], "whole numbers separated by commas"),
-        (["study", CONNECTOR, "--out", "new", "--seeds", "\u0661"], "whole numbers separated by commas"),
-        (["study", CONNECTOR, "--out", "new", "--seeds", "1,1"], "given twice"),
-        (["study", CONNECTOR, "--out", "new", "--seeds=-1"], "seeds, 0: "),
-        (["study", CONNECTOR, "--out", "new", "--methods", "skgrll"], "did you mean skgrl?"),
-        (["study", CONNECTOR, "--out", "new", "--engine", "rya"], "did you mean ray?"),
-        (["study", CONNECTOR, "--out", "new", "--processes", "0"], "at least one process"),
-        (["study", CONNECTOR, "--out", "new", "--address", "auto"], "give --engine ray too"),
         (["teleoperate", "Puring"], "did you mean Pouring?"),
         (["teleoperate", "Pouring", "--json"], "give --record too"),
         *(
@@ -126,14 +98,8 @@ CONNECTOR = str(study_path("connector"))
         (["train", "BncConnector", "--out", "new", "--env", "bound=a"], "bound must be a number, not 'a'"),
         (["train", "lab/Own", "--out", "new"], "or --import the file that registers it"),
         (["sim-driver", "--seconds", "nan"], "seconds must be a positive number, not nan"),
-        (["sim-driver", "--seconds", "-1"], "seconds must be a positive number, not -1"),
-        (["sim-driver", "--command-timeout", "0"], "must be a positive number, not 0"),
-        (["sim-driver", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in meters"),
         (["sim-driver", "--offset", "1.5"], "--offset takes 2 numbers"),
-        (["sim-driver", "--rate", "0"], "not 0"),
-        (["sim-driver", "--driver", "rtd"], "there is no simulated driver 'rtd'"),
         (["demo", "--episodes", "0", "--out", "new"], "at least one episode, not 0"),
-        (["demo", "--seed", "-1", "--out", "new"], "a seed is a whole number"),
         (["deploy", "new", "--sim", "--robot-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["list", "metrix"], "did you mean metrics?"),
         *(
@@ -229,13 +195,6 @@ def test_evaluate_prints_one_json_object(capsys, bead_run):
     assert statistics <= result.keys()
     assert result["episodes"] == 3
     assert 0 <= result["success_rate"] <= 1
-
-
-def test_evaluate_is_reproducible_and_depends_on_seed(capsys, bead_run):
-    first, second = (call(capsys, "evaluate", bead_run, "--episodes", 3, "--json")[1] for _ in range(2))
-    third = call(capsys, "evaluate", bead_run, "--episodes", 3, "--json", "--seed", 9)[1]
-    assert first == second
-    assert json.loads(first)["mean_return"] != json.loads(third)["mean_return"]
 
 
 def test_evaluate_refuses_a_damaged_policy(capsys, bead_run):
@@ -415,27 +374,6 @@ def test_train_accepts_any_option_of_an_environment(capsys, tmp_path):
     assert (environment["action_repeat"], environment["wall"]) == (3, 0.75)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("1e-8", 1e-8),
-        ("[0, 1]", (0, 1)),
-        ("[1e3, 2]", (1000.0, 2)),
-        ("true", True),
-        ("arm", "arm"),
-        ("null", None),
-        ("2001-99-99", "2001-99-99"),
-        ("1_0", "1_0"),
-        ("\u0661", "\u0661"),
-        ("a: b: c", "a: b: c"),
-        ("[" * 99, "[" * 99),
-    ],
-)
-def test_env_values_are_read_as_yaml(text, value):
-    read = as_value(text)
-    assert (read, type(read)) == (value, type(value))
-
-
 def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch):
     information = tmp_path / "lab_broken-1.0.dist-info"
     information.mkdir()
@@ -508,26 +446,3 @@ def test_visualize_prints_a_line_before_the_simulation(capsys, tmp_path, monkeyp
     assert code == 2
     assert err.startswith("guiderail: simulating held-out episodes (1) before and after learning, then writing ")
     assert err.endswith("\nguiderail: stopped\n")
-
-
-@pytest.mark.parametrize(
-    ("command", "has_checkpoint", "message"),
-    [
-        (["train", "BncConnector", "--out"], True, "stopped; resume with --resume"),
-        (["train", "BncConnector", "--out"], False, "stopped"),  # a run on hardware has no checkpoint
-        (["study", "connector", "--out"], False, "stopped; the same command resumes it"),
-        (["evaluate"], False, "stopped"),
-    ],
-)
-def test_interrupted_command_prints_how_to_resume(command, has_checkpoint, message, capsys, tmp_path, monkeypatch):
-    def interrupt(**options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("guiderail.tools.cli.main.app", interrupt)
-    if has_checkpoint:
-        (tmp_path / "checkpoint").mkdir()
-    for arguments in ([*command, str(tmp_path)], [*command[:-1], f"{command[-1]}={tmp_path}"]):
-        with pytest.raises(SystemExit) as end:
-            main(arguments)
-        assert end.value.code == 130
-        assert capsys.readouterr().err.strip().removeprefix("guiderail: ") == message

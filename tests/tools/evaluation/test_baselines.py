@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks.bnc_connector import (
     GAIN,
     NUM_STEPS,
     PRESSING,
@@ -11,7 +11,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
     TORQUE_Y,
     Z,
 )
-from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, scripted_search, straight_descent
+from guiderail.diagrams.tasks.grid_clamp import scripted_gentle_search, scripted_search, straight_descent
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy

@@ -2,7 +2,6 @@
 
 from contextlib import ExitStack
 from dataclasses import replace
-from unittest.mock import Mock
 
 import pytest
 
@@ -81,15 +80,6 @@ def test_run_is_unchanged_when_its_checkpoint_is_unfit(lost_entry, bead_config, 
     with refused("belongs to other settings"):
         run_training(folder, bead_config, resume=True)
     assert content(folder) == before
-
-
-def test_defect_of_a_learner_is_not_reported_as_other_settings(bead_config, folder, monkeypatch):
-    run_training(folder, replace(bead_config, episodes=3))
-    monkeypatch.setattr(
-        "guiderail.tools.learning.off_policy.OffPolicyLearner.restore", Mock(side_effect=AttributeError)
-    )
-    with pytest.raises(AttributeError):
-        run_training(folder, bead_config, resume=True)
 
 
 def test_run_starts_again_when_killed_before_its_configuration(bead_run, bead_config, folder):

@@ -10,7 +10,6 @@ from stable_baselines3 import SAC
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.fast_sb3 import FastTrainingStep
 from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 
@@ -119,24 +118,6 @@ def test_fast_step_continues_stable_baselines3_state(plain, ensemble):
     assert result.state()[0].keys() == arrays.keys()
     train_both(expected, result, seed=1)
     assert_equal(expected, result, 2e-6)
-
-
-def test_flat_adam_refuses_moments_of_other_shapes():
-    optimizer = make(SacLearner).model.actor.optimizer
-    optimizer.step()
-    stored = optimizer.state_dict()["state"]
-    with pytest.raises(ValueError, match="another shape"):
-        optimizer.load_state_dict({"state": stored | {0: {name: value.flatten() for name, value in stored[0].items()}}})
-    with pytest.raises(ValueError, match="moments of 1"):
-        optimizer.load_state_dict({"state": {0: stored[0]}})
-
-
-def test_fast_step_refuses_unsupported_activations():
-    class UnsupportedSac(FastTrainingStep, SAC):
-        pass
-
-    with pytest.raises(TypeError, match="GELU"):
-        UnsupportedSac("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
 
 
 def test_learning_does_not_import_pytorchs_compiler(forks):

@@ -10,7 +10,7 @@ from guiderail.diagrams.envs.observation import ImageAndStateSpace
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import LEARNERS, described_observation
+from guiderail.tools.learning.learner import LEARNERS, describe_interface
 from guiderail.tools.learning.learner_config import resolve_preset
 
 SHAPE = (16, 17, 3)
@@ -52,7 +52,7 @@ def test_policy_acts_as_its_learner(space, algorithm, encoder, tmp_path):
     learner, rng = make(space, algorithm, **{"net_arch.image_encoder": encoder}), np.random.default_rng(0)
     learn(learner, space, rng)
     assert learner.model.replay_buffer.observations.dtype == np.uint8
-    learner.policy(described_observation(SpacesOnlyEnv(space))).save(tmp_path)
+    learner.policy(describe_interface(SpacesOnlyEnv(space))).save(tmp_path)
     policy, learner.is_greedy = Policy.load(tmp_path), True
     for _ in range(5):
         observation = observe(space, rng)
@@ -97,14 +97,3 @@ def test_restored_learner_continues_as_without_interruption():
 def test_cuda_is_refused_when_absent():
     with pytest.raises(InputError, match="no CUDA device"):
         make(IMAGE_AND_STATE, device="cuda")
-
-
-def test_image_learner_refuses_unsupported_settings():
-    with pytest.raises(InputError, match="cannot use cuda"):
-        resolve_preset("tqc_contact", "tqc", {"device": "cuda", "num_envs": 2})
-    with pytest.raises(InputError, match="target actor"):
-        make(IMAGE_AND_STATE, "td3")
-    with pytest.raises(InputError, match="privileged critic takes no images"):
-        make(IMAGE_AND_STATE, privileged_critic=True)
-    with pytest.raises(InputError, match="too small"):
-        make(spaces.Box(0, 255, (6, 6, 3), np.uint8))

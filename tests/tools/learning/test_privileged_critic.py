@@ -93,23 +93,6 @@ def test_only_a_privileged_critic_learns_a_hidden_reward():
     assert error(True) < 0.3 * error(False)
 
 
-@pytest.mark.parametrize(("plain", "fast"), [(PlainSac, SacLearner), (PlainTqc, TqcLearner)])
-def test_fast_step_equals_the_step_of_stable_baselines3(plain, fast):
-    learners = [make(kind, learning_rate=1e-4) for kind in (plain, fast)]
-    np.random.seed(0)  # noqa: NPY002 (Stable-Baselines3 samples from it)
-    batches = learners[0].model.replay_buffer.sample(4 * 8)
-    split = [[None] * 4 if array is None else array.split(8) for array in batches]
-    single_batches = iter(zip(*split, strict=True))
-    samplers = (lambda _, env=None: type(batches)(*next(single_batches)), lambda _, env=None: batches)
-    for learner, sample in zip(learners, samplers, strict=True):
-        learner.model.replay_buffer.sample = sample
-        torch.manual_seed(0)
-        learner.model.train(4, 8)
-    for network in ("actor", "critic", "critic_target"):
-        expected, result = (parameters_to_vector(getattr(x.model, network).parameters()).detach() for x in learners)
-        torch.testing.assert_close(result, expected, rtol=0, atol=2e-6)
-
-
 def test_symmetry_transforms_hidden_values():
     signs = [(-1.0, 1.0, 1.0, 1.0, 1.0), (1.0, -1.0), (1.0, -1.0, 1.0)]
     config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"symmetry": True})
@@ -133,15 +116,6 @@ def test_state_is_restored_exactly():
         each.model.train(4, 8)
     expected, result = (parameters_to_vector(each.model.critic.parameters()) for each in (learner, restored))
     torch.testing.assert_close(result, expected, rtol=0, atol=0)
-
-
-def test_learner_raises_when_no_privileged_space_is_declared():
-    class Plain(gymnasium.Env):
-        observation_space, action_space = Vector.observation_space, Vector.action_space
-
-    with pytest.raises(InputError, match="privileged_critic out"):
-        make(env=Plain(), transitions=0)
-    assert make(env=SpacesOnlyEnv(Vector()), transitions=0)._num_privileged == HIDDEN
 
 
 def test_insertion_declares_pose_and_exact_wrench():

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.environments import check_environment, make_environment
-from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy, uniform_random
+from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization import replay
@@ -159,25 +158,6 @@ def test_page_has_the_report_command_of_its_run(tmp_path):
 )
 def test_violation_unit_depends_on_the_bounded_outputs(constraints, outputs, unit):
     assert violation_unit(constraints, outputs)[0] == unit
-
-
-def test_write_page_refuses_zero_episodes(tmp_path):
-    spec = EpisodeSpec(
-        "NarrowPassage", {}, lambda env: BaselinePolicy(uniform_random, env), "uniform_random", "uniform_random"
-    )
-    with pytest.raises(InputError, match="at least one episode"):
-        write_page(tmp_path / "replay.html", spec, episodes=0)
-
-
-@pytest.mark.parametrize("name", ["policy.safetensors", "."])
-def test_write_page_refuses_an_ending_before_the_episodes(name, tmp_path):
-    (tmp_path / "policy.safetensors").write_text("weights")
-    spec = EpisodeSpec(
-        "NarrowPassage", {}, lambda env: pytest.fail("an episode is run"), "uniform_random", "uniform_random"
-    )
-    with pytest.raises(InputError, match="a page is"):
-        write_page(tmp_path / name, spec)
-    assert (tmp_path / "policy.safetensors").read_text() == "weights"
 
 
 def test_motion_has_the_contacts_of_a_pressed_tool():

@@ -10,9 +10,9 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.registry import build_guidance
-from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
 from guiderail.models.common.transforms import WRENCH_SIZE
-from guiderail.models.control.wrench import center_of_pressure
+from guiderail.models.control.wrench import ContactPointMean, center_of_pressure
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.export import TrainedSkill
@@ -40,8 +40,8 @@ def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int 
     rng, rows, start = np.random.default_rng(seed), [], _start(skill)
     period, size = skill.prior.period, skill.prior.pose_size
     entries = skill.description["observation"]
+    guidance = build_guidance(skill.config.environment["guidance"], skill.prior)
     for _ in range(episodes):
-        guidance = build_guidance(skill.config.environment["guidance"], skill.prior)
         simulator = Simulator(guidance)
         context = simulator.get_mutable_context()
         ports = {name: guidance.GetInputPort(name) for name in ("action", "pose", "wrench")}
@@ -51,6 +51,7 @@ def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int 
             port.FixValue(context, values[name])
         simulator.Initialize()
         command = guidance.GetOutputPort("desired_pose").Eval(context)
+        contact = ContactPointMean(MIN_CONTACT_FORCE, CONTACT_MEMORY / period)
         for step in range(skill.num_steps):
             pose = values["pose"] if step == 0 else command + TRACKING_SPREAD * rng.normal(size=size)
             raw = _random_signals(entries, signals, rng)
@@ -58,12 +59,15 @@ def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int 
                 own = {"time": [step * period], "pose": pose, "desired_pose": command}
                 if signals.get("wrench") == WRENCH_SIZE:
                     own["center_of_pressure"] = center_of_pressure(raw["wrench"], MIN_CONTACT_FORCE)
+                    own["mean_contact_point"] = contact.relative_to(pose)
                 own["phase"] = [-1.0 + 2.0 * step / skill.num_steps]
                 for name in ("state", "transition_distance"):
                     if guidance.HasOutputPort(name):
                         own[name] = guidance.GetOutputPort(name).Eval(context)
                 observed = {name: np.array(own.get(name, raw[name])) for name in signals}
                 action = double_action(skill.policy, _observe(entries, observed))
+            if signals.get("wrench") == WRENCH_SIZE:
+                contact.add(pose, raw["wrench"])
             for name, value in (("action", action), ("pose", pose)):
                 ports[name].FixValue(context, value)
             simulator.AdvanceTo((step + 1) * period)

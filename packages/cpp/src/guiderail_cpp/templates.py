@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
 from guiderail.models.templates import SharedControlTemplate, mappings, transitions
 from guiderail.models.templates import active_constraints as active
-from guiderail.models.templates.geometry import WORLD, StatePart, matrix_deg
+from guiderail.models.templates.parts import WORLD, StatePart, matrix_deg
 
 # Kinds in the order of the enumerations in template.hpp.
 MAPPINGS: tuple[type, ...] = (mappings.Translation, mappings.Rotation, mappings.TiltTowards)

@@ -12,10 +12,10 @@ import yaml
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import visible_files
-from guiderail.models.common.plugins import require_sibling
+from guiderail.models.common.registry import require_sibling
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
-from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
+from guiderail.models.primitives.fit import MIN_SHARE, share_within_spread
 from guiderail.tools.files import (
     ENDINGS,
     check_new,
@@ -247,13 +247,13 @@ def fit_primitive(demonstrations: Demonstrations, log: Callable[[str], object] |
     from guiderail.models.primitives.fit import fit
 
     chosen = fit(demonstrations, floor=_variance_floor(demonstrations), log=log)
-    share = estimated_share(chosen.reference, SquaredExponential(), lambda_=6.0, beta=6.0)
+    share = share_within_spread(chosen.reference, SquaredExponential(), lambda_=6.0, beta=6.0)
     verdict = "follows the demonstrations" if share >= MIN_SHARE else "LEAVES the demonstrations: use these values"
     return {
         "components": chosen.components,
-        "length_scale": float(f"{chosen.length_scale:.4g}"),
+        "length_scale": float(f"{chosen.kernel.length_scale:.4g}"),
         "lambda_": float(f"{chosen.lambda_:.4g}"),
-        "beta": float(f"{chosen.beta:.4g}"),
+        "beta": float(f"{chosen.lambda_:.4g}"),
         "why": chosen.why,
         "with the defaults": f"λ = β = 6 and length_scale = 0.5: {share:.1%} of the steps within; {verdict}",
     }

@@ -34,9 +34,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import damping_matrix
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.robot import EndEffector, Robot, find_robot
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.joint_torque_wrench import JointTorqueWrench
+from guiderail.systems.command_checks import CommandWatchdog
 from guiderail.systems.support.declarations import output_getter
+from guiderail.systems.wrench_sensors import JointTorqueWrench
 from guiderail.systems.wrench_signals import WrenchTare
 from guiderail_hardware.drivers.driver import (
     Driver,

@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers import clock as clock_module
 from guiderail_hardware.drivers.clock import IntervalHistogram, WallClock

@@ -1,6 +1,9 @@
 """Drivers: a user's driver with only `read` and `write`, registration, and refused drivers and robots."""
 
+import re
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from direct_driver import START, DirectDriver, start_station
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import find_robot
 from guiderail_hardware.drivers.clock import WallClock
@@ -151,3 +154,18 @@ def test_safety_monitor_raises_when_commands_are_not_readable():
     plant = driver.model.plant
     with pytest.raises(InputError, match="cannot be watched"):
         SafetyMonitor(driver, plant, safety_limits(plant, driver))
+
+
+def test_every_driver_of_the_package_is_an_entry_point():
+    package = Path(__file__).parents[2]
+    points = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]["guiderail"]
+    declared = {name.removeprefix("driver:") for name in points if name.startswith("driver:")}
+    sources = (path.read_text() for path in (package / "src/guiderail_hardware/drivers").glob("*.py"))
+    registered = {
+        name for source in sources for name in re.findall(r'^@register_driver\("(\w+)"\)', source, re.MULTILINE)
+    }
+    assert declared == registered
+    for name, place in points.items():
+        if name.startswith("driver:"):
+            module, _, attribute = place.partition(":")
+            assert f"class {attribute}(" in (package / "src" / f"{module.replace('.', '/')}.py").read_text()

@@ -9,7 +9,7 @@ from direct_driver import START, DirectDriver, start_station
 from hardware_doubles import unplugged
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.clock import WallClock
 from guiderail_hardware.drivers.driver import PoseDriver, describe_stop

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers import fci
 from guiderail_hardware.drivers.driver import describe_stop

@@ -9,7 +9,7 @@ from hardware_doubles import unplugged
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail_hardware.drivers.driver import safety_limits, torque_tolerance

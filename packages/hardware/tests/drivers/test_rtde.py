@@ -13,7 +13,7 @@ from rtde_server import END_FORCE_MODE, FORCE_MODE, ZERO_SENSOR, DirectClient, R
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers import rtde
 from guiderail_hardware.drivers.rtde import RtdeDriver

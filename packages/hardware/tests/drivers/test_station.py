@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.driver import find_driver, safety_limits
 from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver

@@ -16,7 +16,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
@@ -35,7 +35,7 @@ from guiderail_hardware.robot.preflight import start_simulator
 from guiderail_hardware.station import HardwareStation
 
 USER_MODULE = """
-from guiderail.diagrams.tasks.bnc_connector.task import BncConnector
+from guiderail.diagrams.tasks.bnc_connector import BncConnector
 from guiderail.diagrams.tasks.registry import register_task
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail_hardware.drivers.lcm_simulated import SimulatedIiwa

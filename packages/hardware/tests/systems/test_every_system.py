@@ -8,7 +8,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware import systems
 from guiderail_hardware.models.joint_status import StatusLimits
 from oracles.franka import FRANKA_LIMITS

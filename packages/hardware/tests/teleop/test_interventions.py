@@ -228,7 +228,6 @@ def assert_refused(learner, message, folder, episodes):
 @pytest.mark.parametrize(
     ("columns", "policy", "message"),
     [
-        ([None], Policy, "on_episode_end must return a dictionary, not None"),
         ([{"return": 0.0}], Policy, "returns the column 'return', which"),
         ([{"word": "good"}], Policy, "the column 'word' of an episode must be a number, not 'good'"),
         ([{"a": 1}, {"b": 1}], Policy, "the column 'a' is missing in some episodes"),

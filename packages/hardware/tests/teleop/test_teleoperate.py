@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.task import scripted_pour
+from guiderail.diagrams.tasks.pouring import scripted_pour
 from guiderail.models.policy import Policy
 from guiderail_hardware.teleop.recorder import run_episode
 from guiderail_hardware.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS

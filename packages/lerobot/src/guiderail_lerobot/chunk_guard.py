@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
-from guiderail.models.primitives.qp import UnsolvableError, find_solver, solve_least_norm
+from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 MODES = ("projection", "slowdown")
 RATES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)  # relative speeds along the chunk that a slowdown tries
@@ -89,7 +89,6 @@ class ChunkGuard:
         coupled = (constraints.G != 0).T.astype(float) @ (constraints.G != 0)
         number, labels = connected_components(coupled, directed=False)
         self._groups = [np.flatnonzero(labels == group) for group in range(number)]
-        self._solve = find_solver("daqp")
         self.reset(start)
 
     def reset(self, start: np.ndarray) -> None:
@@ -241,9 +240,7 @@ class ChunkGuard:
         used = length > 0
         if (lower[~used] > 0.0).any() or (upper[~used] < 0.0).any():
             raise UnsolvableError("the executed outputs violate a limit")
-        v, _ = solve_least_norm(
-            A[used] / length[used, None], lower[used] / length[used], upper[used] / length[used], self._solve
-        )
+        v, _ = solve_least_norm(A[used] / length[used, None], lower[used] / length[used], upper[used] / length[used])
         return self._step[group] * v.reshape(steps, size)
 
     def is_within(self, chunk: np.ndarray, past: np.ndarray | None = None) -> bool:

@@ -39,12 +39,9 @@ class ChunkLearner(BcLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If the environment is not built from a task's diagram, or `pipelined` or `num_envs` is set.
+            InputError: If the environment is not built from a task's diagram.
         """
         super().__init__(config, env, **arguments)
-        for name in ("pipelined", "num_envs"):
-            if getattr(config, name):
-                raise InputError(f"{config.algorithm} needs the environment in this process: leave {name} out")
         if not hasattr(env.unwrapped, "trace"):
             raise InputError(f"{config.algorithm} needs an environment that is built from a task's diagram")
         self._env = cast(Any, env.unwrapped)
@@ -157,6 +154,7 @@ class ChunkLearner(BcLearner):
         return Policy(
             layers,
             {
+                **description,  # its limits are those of the environment's actions; those below are of chunks
                 "format": FORMAT,
                 "pool": 1,
                 "activation": "relu",
@@ -164,7 +162,6 @@ class ChunkLearner(BcLearner):
                 "action_low": np.tile(low, ensemble).tolist(),
                 "action_high": np.tile(high, ensemble).tolist(),
                 "chunk": [ensemble, self.config.chunk_steps, self._num_outputs],
-                **description,
             },
         )
 

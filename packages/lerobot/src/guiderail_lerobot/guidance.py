@@ -36,7 +36,7 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     """
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
     if motion is not None and (
-        motion.outside or motion.inside or motion.state or np.isfinite(np.asarray(motion.max_acceleration)).any()
+        motion.outside or motion.state or np.isfinite(np.asarray(motion.max_acceleration)).any()
     ):
         raise InputError(
             "a guard limits only speed and jerk, within linear bounds: leave max_acceleration, "

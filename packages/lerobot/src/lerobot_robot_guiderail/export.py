@@ -1,4 +1,7 @@
-"""Export of a guiderail policy as a LeRobot policy: `python -m lerobot_robot_guiderail.export RUN OUT`."""
+"""Export of a guiderail policy as a LeRobot policy: `python -m lerobot_robot_guiderail.export RUN OUT [USER/NAME]`.
+
+With a third argument the folder is uploaded to the Hugging Face Hub.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,12 @@ import sys
 from pathlib import Path
 
 import torch
+from huggingface_hub import HfApi
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors.torch import load_file
 
+from lerobot_robot_guiderail.card import write_card, write_environment
 from lerobot_robot_guiderail.configuration_guiderail import GuiderailConfig
 from lerobot_robot_guiderail.modeling_guiderail import GuiderailPolicy
 from lerobot_robot_guiderail.processor_guiderail import make_guiderail_pre_post_processors
@@ -19,10 +24,11 @@ FORMAT = "guiderail policy 2"
 
 
 def export(run: Path | str, out: Path | str) -> GuiderailPolicy:
-    """Write the policy of a run as a folder that LeRobot loads.
+    """Write the policy of a run as a folder that LeRobot loads, with a model card and its environment for EnvHub.
 
     Args:
-        run: Folder with guiderail's `policy.json` and `policy.safetensors`.
+        run: Folder with guiderail's `policy.json` and `policy.safetensors`. With `config.yaml`, `env.py` is written as
+            well; `evaluation.json`, the output of `guiderail evaluate RUN --json`, is summarized in the card.
         out: Folder to write.
 
     Returns:
@@ -56,11 +62,31 @@ def export(run: Path | str, out: Path | str) -> GuiderailPolicy:
     policy.save_pretrained(out)
     for processor in make_guiderail_pre_post_processors(config):
         processor.save_pretrained(out)
+    write_card(run, out)
+    write_environment(run, out)
     return policy
 
 
+def push_to_hub(folder: Path | str, repo_id: str, *, private: bool = False) -> str:
+    """Upload an exported folder to the Hugging Face Hub; `GuiderailPolicy.from_pretrained(repo_id)` loads it.
+
+    Args:
+        folder: Folder that `export` wrote.
+        repo_id: USER/NAME of the repository, which is created if it does not exist.
+        private: If True, a new repository is private.
+
+    Returns:
+        URL of the commit.
+    """
+    api = HfApi()
+    api.create_repo(repo_id, private=private, exist_ok=True)
+    return str(api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message="Upload a guiderail policy"))
+
+
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        sys.exit("python -m lerobot_robot_guiderail.export RUN OUT")
-    export(*sys.argv[1:])
+    if not 3 <= len(sys.argv) <= 4:
+        sys.exit("python -m lerobot_robot_guiderail.export RUN OUT [USER/NAME]")
+    export(*sys.argv[1:3])
     print(f"{sys.argv[2]}: use it by lerobot-rollout --policy.path={sys.argv[2]}")
+    if len(sys.argv) == 4:
+        print(push_to_hub(*sys.argv[2:]))

@@ -16,6 +16,8 @@ from safetensors.numpy import save_file
 
 FILE = Path(__file__).parents[2] / "src/lerobot_robot_guiderail/export.py"
 DOUBLES = {
+    "huggingface_hub": ("HfApi",),
+    "lerobot_robot_guiderail.card": ("write_card", "write_environment"),
     "lerobot.configs": ("FeatureType", "PolicyFeature"),
     "lerobot.utils.constants": ("ACTION", "OBS_STATE"),
     "lerobot_robot_guiderail.configuration_guiderail": ("GuiderailConfig",),
@@ -49,3 +51,11 @@ def test_policy_that_observes_images_is_refused(module, observation, tmp_path):
     (tmp_path / "policy.json").write_text(json.dumps(description))
     with pytest.raises(ValueError, match="observes images"):
         module.export(tmp_path, tmp_path / "out")
+
+
+def test_exported_folder_is_uploaded_to_a_repository(module, tmp_path):
+    api = module.HfApi.return_value
+    api.upload_folder.return_value = "https://huggingface.co/lab/connector/commit/1"
+    assert module.push_to_hub(tmp_path, "lab/connector", private=True).endswith("/commit/1")
+    api.create_repo.assert_called_once_with("lab/connector", private=True, exist_ok=True)
+    assert api.upload_folder.call_args.kwargs["folder_path"] == tmp_path

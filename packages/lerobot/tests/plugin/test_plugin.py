@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
@@ -15,7 +16,8 @@ from lerobot.robots import RobotConfig, make_robot_from_config
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot_robot_guiderail.export import FORMAT, export
+from lerobot_robot_guiderail.export import FORMAT, export, push_to_hub
+from lerobot_robot_guiderail.modeling_guiderail import GuiderailPolicy
 from safetensors.numpy import save_file
 
 PYTHON = os.environ["GUIDERAIL_PYTHON"]
@@ -213,3 +215,61 @@ def test_rollout_of_lerobot_executes_an_exported_policy(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Duration limit reached" in done.stderr + done.stdout
+
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+class LocalHub:
+    """Double of `HfApi` that stores an upload where the library keeps downloads."""
+
+    def __init__(self, cache):
+        self.cache = cache
+
+    def create_repo(self, repo_id, **_):
+        self.repository = self.cache / f"models--{repo_id.replace('/', '--')}"
+
+    def upload_folder(self, *, repo_id, folder_path, **_):
+        shutil.copytree(folder_path, self.repository / "snapshots" / COMMIT)
+        (self.repository / "refs").mkdir()
+        (self.repository / "refs" / "main").write_text(COMMIT)
+        return f"https://huggingface.co/{repo_id}/commit/{COMMIT}"
+
+
+def test_pushed_policy_is_loaded_from_the_local_cache(tmp_path, monkeypatch):
+    write_policy(tmp_path / "run", [7, 8, 3])
+    (tmp_path / "run" / "config.yaml").write_text("task: NarrowPassage\nenvironment: {guidance: kgrl}\nimports: []\n")
+    written = export(tmp_path / "run", tmp_path / "out")
+    monkeypatch.setattr("lerobot_robot_guiderail.export.HfApi", lambda: LocalHub(tmp_path / "cache"))
+    assert push_to_hub(tmp_path / "out", "lab/passage").endswith(COMMIT)
+    loaded = GuiderailPolicy.from_pretrained("lab/passage", cache_dir=tmp_path / "cache", local_files_only=True)
+    state = {OBS_STATE: torch.linspace(-1.0, 1.0, 7)[None]}
+    torch.testing.assert_close(loaded.select_action(state), written.select_action(state), rtol=0.0, atol=0.0)
+    snapshot = tmp_path / "cache" / "models--lab--passage" / "snapshots" / COMMIT
+    assert {"README.md", "env.py", "requirements.txt"} < {path.name for path in snapshot.iterdir()}
+
+
+RECORD = """
+import sys
+from guiderail_data.episodes import record_episodes
+options = {"guidance": "kgrl", "station": "gantry"}
+record_episodes("scripted", sys.argv[1], "lerobot", task="BncConnector", environment=options, episodes=2)
+"""
+
+
+def test_recorded_episodes_have_the_wrench_as_a_feature(tmp_path):
+    subprocess.run([PYTHON, "-c", RECORD, str(tmp_path / "data")], check=True)
+    data = LeRobotDataset("lab/connector", root=tmp_path / "data")
+    assert data.num_episodes == 2
+    assert data.meta.features["observation.wrench"]["names"] == [
+        "Fx [N]",
+        "Fy [N]",
+        "Fz [N]",
+        "Mx [Nm]",
+        "My [Nm]",
+        "Mz [Nm]",
+    ]
+    forces = torch.stack([data[k]["observation.wrench"][:3].norm() for k in range(len(data))])
+    assert torch.isfinite(forces).all()
+    assert forces.max() > 1.0  # [N], the plug presses on the rim
+    assert data[0]["action"].shape == data[0][OBS_STATE].shape

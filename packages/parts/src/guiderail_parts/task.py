@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, Literal, Self, cast
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, OutputPort
@@ -23,7 +23,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import MovableWorkcell
-from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector import BncUncertainty
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import (
     HOLD_DISTANCE,
@@ -50,7 +50,7 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.history import HistoryBuffer
+from guiderail.systems.movement_primitive import HistoryBuffer
 from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
@@ -266,7 +266,8 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]  # content of `task.yaml`
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
         """Refuse a square of offsets that are not sampled in every episode, and a `task.yaml` without success."""
         if self.offset_shape == "square" and self.fixture_offset != "per_episode":
             raise InputError(
@@ -274,6 +275,7 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
                 "or offset_shape=ring"
             )
         self._check_length_and_start()
+        return self
 
     @property
     def offsets(self) -> PartUncertainty:

@@ -19,7 +19,7 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE, control_steps
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import MissingSiblingError, load_plugin, require_sibling
+from guiderail.models.common.registry import MissingSiblingError, load_plugin, require_sibling
 from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.sdf import TriangleMesh

@@ -25,6 +25,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
+from guiderail.diagrams.envs.options import flat_options
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import (
@@ -43,7 +44,6 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.learner_config import flat_settings
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, configure, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome
@@ -103,7 +103,7 @@ class Job:
         choices = [study.learner, method.learner]
         chosen = {k: getattr(c, k) for c in choices for k in ("algorithm", "preset") if k in c.model_fields_set}
         given: dict[str, Any] = {k: v for k, v in chosen.items() if v is not None}
-        settings = flat_settings(study.learner.settings) | flat_settings(method.learner.settings)
+        settings = flat_options(study.learner.settings) | flat_options(method.learner.settings)
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings

@@ -77,7 +77,7 @@ def _clearance(environment: Environment, value: float) -> dict[str, Any]:
 
 
 def _offsets(environment: Environment, value: float) -> dict[str, Any]:
-    from guiderail.diagrams.tasks.bnc_connector.options import OFFSET_RANGES
+    from guiderail.diagrams.tasks.bnc_connector import OFFSET_RANGES
     from guiderail.diagrams.tasks.options import NEGLIGIBLE_OFFSET
 
     if "offset_range" not in environment:

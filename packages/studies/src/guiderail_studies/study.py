@@ -26,7 +26,7 @@ from guiderail.tools.evaluation.metrics import statistics_of, wilson
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import installed_versions
-from guiderail.tools.tables import write_table
+from guiderail.tools.tables import cell, write_table
 from guiderail.tools.visualization.figures import legend, new_figure, save_figure
 from guiderail_studies.declaration import Ratio, Study, Sweep, source_file
 from guiderail_studies.engines.engine import Engine, Outcome, make_engine
@@ -97,7 +97,9 @@ def study_command(
     *,
     file: Path | None = None,
 ) -> dict[str, Any]:
-    """Run a study by `run_study`, write its table as `.csv` and `.md`, draw its sweeps, and return a summary.
+    """Run a study by `run_study`, write its tables, draw its sweeps, and return a summary.
+
+    The `.csv` file has every column and a row for each seed, the `.md` file a row for each method.
 
     Args:
         study: As in `run_study`.
@@ -124,7 +126,8 @@ def study_command(
     if file is not None:
         source = {"file": str(file), "imports": bool(study.imports)}
         write_atomically(source_file(out, study.name), json.dumps(source).encode())
-    result["table"] = str(write_table(out / (table or study.name), rows.drop(columns="folder")))
+    table_path = out / (table or study.name)
+    result["table"] = str(write_table(table_path, rows.drop(columns="folder"), method_rows(rows)))
     if study.sweeps:
         result["picture"] = str(draw_sweeps(study, rows, out / f"{table or study.name}.png"))
         result |= breaking_points(study, rows)
@@ -155,6 +158,61 @@ def differences_by_method(study: Study, describe_differences: DescribeDifference
         groups.setdefault(tuple(sentence for sentence in sentences if sentence not in common), []).append(method)
     shared = {ALL_METHODS: common} if common else {}
     return shared | {", ".join(methods): list(sentences) for sentences, methods in groups.items() if sentences}
+
+
+def method_rows(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return a row for each method, number of training episodes and evaluation set, with few columns.
+
+    A number is the mean over seeds, followed by the smallest and the largest one; forces are the largest of all seeds,
+    and episodes with a violation those of all seeds together.
+    """
+    summary, keys = [], ["method", "after_episodes", "eval_set"]
+    rows = rows.reindex(columns=[*keys, "episodes", *_SUMMARIZED])  # a study of baselines has no columns of training
+    for (method, after, eval_set), group in rows.groupby(keys, sort=False, dropna=False):
+        values = {name: pd.to_numeric(group[name], errors="coerce").to_numpy(float) for name in _SUMMARIZED}
+        converged = values["training_episodes_to_convergence"]
+        never = int(np.isnan(converged).sum()) if after else 0
+        summary.append(
+            {
+                "method": method,
+                "seeds": len(group),
+                "training episodes": after,
+                "evaluation set": eval_set,
+                "episodes per seed": group["episodes"].iloc[0],
+                "success [%]": _spread(100.0 * values["success_rate"]),
+                "return": _spread(values["mean_return"]),
+                "largest force [N]": _combined(np.nanmax, values["peak_force"]),
+                "episodes with a violation": _combined(np.nansum, values["violating_episodes"]),
+                "success in training [%]": _spread(100.0 * values["training_success_rate"]),
+                "training episodes with a violation": _combined(np.nansum, values["training_violating_episodes"]),
+                "episodes to convergence": _spread(converged) + (f", {never} never" if never else ""),
+            }
+        )
+    return summary
+
+
+_SUMMARIZED = (
+    "success_rate",
+    "mean_return",
+    "peak_force",
+    "violating_episodes",
+    "training_success_rate",
+    "training_violating_episodes",
+    "training_episodes_to_convergence",
+)
+
+
+def _spread(values: np.ndarray) -> str:
+    """Return the mean of numbers with the smallest and the largest one as text; a dash without a number."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return cell(None)
+    low, mean, high = (f"{number:.3g}" for number in (known.min(), known.mean(), known.max()))
+    return mean if low == high else f"{mean} ({low}–{high})"
+
+
+def _combined(combine: Callable[[np.ndarray], float], values: np.ndarray) -> str:
+    return cell(None) if np.isnan(values).all() else f"{combine(values):.4g}"
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:

@@ -1,38 +1,17 @@
 """Demonstrations of the BNC connector: shipped files, their covariances, and recording again."""
 
-import os
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
-from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import MM, POSE_NAMES
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
+from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import demonstrations
-from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
-from guiderail.models.primitives import Demonstrations
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS
 from research.generate import bnc_connector as generator
 from research.generate.bnc_connector import TIMES as TIMES_RECORDED
 from research.generate.bnc_connector import record_one
 
 TIMES = 0.02 * np.arange(NUM_STEPS)
-
-
-def test_load_returns_five_demonstrations_of_400_poses():
-    loaded = Demonstrations.load(demonstrations.PATH)
-    assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
-    assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
-    assert loaded.names == POSE_NAMES
-    np.testing.assert_allclose(loaded.times[0], TIMES, atol=1e-9)
-
-
-def test_file_contains_measured_poses_and_wrenches():
-    arrays = np.load(demonstrations.PATH)
-    shape = (NUM_DEMONSTRATIONS, NUM_STEPS)
-    assert arrays["measured"].shape == arrays["wrench"].shape == (*shape, 6)
-    assert arrays["contact_force"].shape == shape
-    assert "locked plug" in str(arrays["frame"])
 
 
 @pytest.mark.parametrize("path", [demonstrations.PATH, demonstrations.SEARCH_PATH], ids=["insertion", "search"])
@@ -53,36 +32,11 @@ def test_stiffness_times_pose_error_is_the_measured_force():
     np.testing.assert_allclose(force.mean(), arrays["wrench"][:, turning, 2].mean(), rtol=0.1)
 
 
-def test_deviations_are_large_at_the_rim_and_small_when_seated():
-    outputs = np.stack(Demonstrations.load(demonstrations.PATH).outputs)
-    deviations = outputs.std(axis=0)[:, :2].mean(axis=1)
-    assert deviations[80:170].mean() > 4.0 * deviations[240:].mean()
-
-
 def test_motions_differ_and_repeat_with_a_seed():
-    motions, again, different = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
+    motions, again, different = (generator.demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
     np.testing.assert_array_equal(motions, again)
     assert np.abs(motions[0] - motions[1])[:, :2].max() > 0.5 * MM
     assert np.abs(motions[0] - different[0])[:, :2].max() > 0.5 * MM
-
-
-def test_mean_of_the_demonstrations_has_no_search_offset():
-    mean = np.mean(Demonstrations.load(demonstrations.PATH).outputs, axis=0)
-    assert np.abs(mean[:, :2]).max() < 0.3 * MM
-
-
-def test_generator_leaves_the_file_when_writing_is_interrupted(tmp_path, monkeypatch):
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    session = replace(generator.INSERT_SESSION, path=tmp_path / "session.npz")
-    monkeypatch.setattr(generator, "record", lambda *_: {"times": np.arange(3.0)})
-    generator.main(session=session)
-    monkeypatch.setattr(generator, "record", lambda *_: {"times": np.arange(9.0)})
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(InputError, match="cannot be written"):
-        generator.main(session=session)
-    np.testing.assert_array_equal(np.load(session.path)["times"], np.arange(3.0))
 
 
 SEARCHING = slice(0, round(demonstrations.SEARCH[1] / 0.02))  # steps until the end of the search
@@ -97,33 +51,21 @@ def test_covariance_is_isotropic_until_the_plug_drops_in():
     assert np.abs(reference.means[SEARCHING, :2]).max() < 0.4 * MM
 
 
-def test_deviations_are_small_after_the_insertion():
-    reference = reference_trajectory("search")
-    seated = slice(round((demonstrations.IN_BY + 0.4) / 0.02), NUM_STEPS)
-    assert reference.standard_deviations[seated, :2].max() < 0.3 * MM
-
-
 def test_firm_search_commands_a_deeper_pose_than_a_light_search():
     searching = slice(round(demonstrations.SEARCH[0] / 0.02), SEARCHING.stop)
     light, firm = (reference_trajectory(name).means[searching, 2] for name in ("search", "firm_search"))
-    assert np.abs(light - firm).mean() == pytest.approx(
-        demonstrations.FIRM_PUSH - demonstrations.LIGHT_PUSH, abs=0.7 * MM
-    )
+    assert np.abs(light - firm).mean() == pytest.approx(generator.FIRM_PUSH - generator.LIGHT_PUSH, abs=0.7 * MM)
     with np.load(demonstrations.FIRM_SEARCH_PATH, allow_pickle=False) as file:
         assert file["contact_force"].max() < 15.0  # [N], the force bound of the task
 
 
-@pytest.mark.parametrize(
-    ("session", "num_steps"),  # number of first poses that are compared with a tolerance of 1e-6
-    [(generator.INSERT_SESSION, 60), (generator.SEARCH_SESSION, 20), (generator.FIRM_SEARCH_SESSION, 20)],
-    ids=["insertion", "search", "firm search on the arm"],
-)
-def test_record_one_reproduces_the_shipped_file(session, num_steps):
+def test_record_one_reproduces_the_shipped_file():
     """The tolerance of the last pose is larger, because contact amplifies rounding, which differs between machines."""
+    session = generator.INSERT_SESSION
     with np.load(session.path, allow_pickle=False) as file:
         arrays = dict(file)
     recording, is_locked = record_one(session.motions(int(arrays["seed"]), TIMES_RECORDED)[0], session.station)
     assert is_locked
     np.testing.assert_allclose(recording["desired_pose"], arrays["outputs"][0], atol=1e-9)
-    np.testing.assert_allclose(recording["pose"][:num_steps], arrays["measured"][0, :num_steps], atol=1e-6)
+    np.testing.assert_allclose(recording["pose"][:60], arrays["measured"][0, :60], atol=1e-6)
     np.testing.assert_allclose(recording["pose"][-1, :3], arrays["measured"][0, -1, :3], atol=0.1 * MM)

@@ -15,17 +15,20 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import (
+from guiderail.models.objects.bnc_connector import (
+    BARREL,
     FOLDER,
     LIP_RISE,
     BncDimensions,
+    barrel_sides,
     bore_mesh,
     face_mesh,
+    files,
+    jack_sdf,
     ring_mesh,
     slot_columns,
     slot_mesh,
 )
-from guiderail.models.objects.bnc_connector.sdf import BARREL, barrel_sides, files, jack_sdf
 from guiderail.models.objects.sdf import TriangleMesh
 from research.generate import generate
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.grid_clamp.geometry import (
+from guiderail.models.objects.grid_clamp import (
     FOLDER,
     GridClampDimensions,
     bead_mesh,
+    files,
     hole_mesh,
     lip_mesh,
     peg_mesh,
     slab_mesh,
 )
-from guiderail.models.objects.grid_clamp.sdf import files
 from research.generate import generate
 
 DIMENSIONS = GridClampDimensions()

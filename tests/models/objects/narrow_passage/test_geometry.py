@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
+from guiderail.models.objects.narrow_passage import PassageGeometry, action_cost
 
 GEOMETRY = PassageGeometry()
 

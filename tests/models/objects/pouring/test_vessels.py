@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_vessel
+from guiderail.models.objects.pouring import MUG, THERMOS, Ball, Vessel, add_ball, add_vessel
 
 
 def drop_ball(vessel, gravity, duration=0.4):

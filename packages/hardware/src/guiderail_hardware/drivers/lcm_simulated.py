@@ -21,7 +21,7 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant, ArmModel, add_ar
 from guiderail.diagrams.stations.station import add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.parsing import follow_directives
-from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.catalog import IIWA14
 from guiderail_hardware.drivers.clock import Clock
 from guiderail_hardware.drivers.lcm import (
     HEAD_FORMAT,

@@ -205,7 +205,7 @@ class RobotEnv(DiagramEnv):
             self._running, self.fault = False, stop.fault
             self._come_to_rest()
             terms = dict.fromkeys(self.diagram.reward_terms, 0.0)
-            info = self._info(0, *self._statistics(first), terms)
+            info = self._info(0, first, terms)
             info |= {"termination": Termination.STOPPED.value, "stopped": str(stop)}
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
@@ -219,21 +219,6 @@ class RobotEnv(DiagramEnv):
     def _extend_return_path(self) -> None:
         """Extend the return path by the motion back along the measured poses of the episode."""
         self._return_path.extend(retrace(self.trace.measured, self.diagram.control_period)[::-1])
-
-    def _statistics(self, first: int) -> tuple[float, float, tuple[float, float], float, bool]:
-        """Return statistics of the control steps from `first` on.
-
-        Returns:
-            The largest commanded and measured violation, the largest forces of impedance and contact [N], the cost,
-            and True if a step was a fallback.
-        """
-        signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
-        if not len(self.trace) > first:
-            return *self._violations, self._forces(0.0, 0.0), 0.0, False
-        commanded, measured = (float(signals[name].max()) for name in ("commanded_violation", "measured_violation"))
-        forces = self._forces(float(self.trace.force[first:].max()), float(signals["contact_force"].max()))
-        cost = float(self.trace.unsafe(first).sum())
-        return commanded, measured, forces, cost, bool(signals["fallback"].any())
 
     def pause(self) -> None:
         """Bring the arm to rest between episodes if the operator has requested a pause; the next reset resumes."""

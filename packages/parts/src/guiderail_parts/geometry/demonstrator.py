@@ -4,10 +4,12 @@ Poses [x y z Rz Ry Rx] are poses of the plug in the target frame [m, rad]. A com
 the plug; under impedance control, the distance of the command from the surface determines the push.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from guiderail.models.common.transforms import DEGREE, MM
-from guiderail.models.objects.bnc_connector.demonstrations import poses, random_curves
+from guiderail.models.objects.bnc_connector.demonstrations import poses
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM  # [m/s]
@@ -135,3 +137,14 @@ def _timed_poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, 
     """Return times (N,) [s] and poses (N, 6) from the duration [s], the height [m] and the turn [rad] of each point."""
     durations, heights, turns = np.array(points).T
     return np.cumsum(durations), poses(heights, turns)
+
+
+def random_curves(rng: np.random.Generator, times: np.ndarray, correlations: Sequence[float], count: int) -> np.ndarray:
+    """Return random curves (count, N, O) of unit variance, one correlation time [s] for each of the O outputs."""
+    return np.stack([np.stack([correlated(rng, times, one) for one in correlations], axis=1) for _ in range(count)])
+
+
+def correlated(rng: np.random.Generator, times: np.ndarray, correlation: float) -> np.ndarray:
+    """Return a random curve (N,) of unit variance, with a Gaussian autocorrelation of width `correlation` [s]."""
+    covariance = np.exp(-0.5 * ((times[:, None] - times) / correlation) ** 2) + 1e-6 * np.eye(len(times))
+    return np.linalg.cholesky(covariance) @ rng.standard_normal(len(times))

@@ -177,7 +177,7 @@ def _with_margin(primitive: LcNsKmp) -> LcNsKmp:
         tightened = LinearConstraints(constraints.G, tighter)
     except InputError as error:
         raise InputError("constraints that leave less than 20 nm of room can't be certified: widen them") from error
-    settings = {name: getattr(primitive, name) for name in ("lambda_", "beta", "horizon", "solver")}
+    settings = {name: getattr(primitive, name) for name in ("lambda_", "beta", "horizon")}
     # No check of the deviation: the motion without constraints is that of `primitive`, which has passed this check.
     return LcNsKmp(primitive.reference, primitive.kernel, constraints=tightened, max_deviation=np.inf, **settings)
 

@@ -74,7 +74,7 @@ class Replay {
     for (std::size_t t = 0; t < steps; ++t) times[t] = step(t);
     const long counted = allocations_;
     std::sort(times.begin(), times.end());
-    std::printf("%zu steps, %.0f %% with an active constraint, largest difference %.3g, %ld allocations, p50 %.2f us, p99.9 %.2f us, max %.2f us\n", steps,
+    std::printf("%zu steps, %.0f %% with an active constraint or limit, largest difference %.3g, %ld allocations, p50 %.2f us, p99.9 %.2f us, max %.2f us\n", steps,
                 100.0 * static_cast<double>(constrained_) / static_cast<double>(steps), worst_, counted,
                 times[steps / 2], times[steps - 1 - steps / 1000], times.back());
     return worst_ <= tolerance_ && counted == 0 ? 0 : 1;
@@ -142,6 +142,13 @@ int replay_guidance(const Data& data, const Data& record, Replay& replay) {
   });
 }
 
+// True if two arrays of six numbers differ by more than rounding, or one is not finite.
+bool differs(const double* first, const double* second) {
+  for (int i = 0; i < 6; ++i)
+    if (!(std::abs(first[i] - second[i]) <= 1e-9)) return true;
+  return false;
+}
+
 int replay_governor(const Data& data, Replay& replay) {
   const Governor governor(data);
   return replay.run([&](std::size_t t) {
@@ -150,6 +157,7 @@ int replay_governor(const Data& data, Replay& replay) {
     const double* max_wrench = replay.row("max_wrench", t);
     const double time = replay.timed([&] { governor.apply(desired, pose, velocity, max_wrench, reference); });
     replay.compare("reference", t, reference);
+    replay.count(differs(reference, desired));
     return time;
   });
 }
@@ -163,6 +171,9 @@ int replay_wrench(const Data& data, Replay& replay) {
     const double *velocity = replay.row("velocity", t), *mass = replay.row("mass", t);
     const double time = replay.timed([&] { wrench = bounded_wrench(spring, damping, velocity, *mass, governor.bound()); });
     replay.compare("wrench", t, wrench.data());
+    Vec6 free;
+    for (int i = 0; i < 6; ++i) free[i] = spring[i] - damping[i];
+    replay.count(differs(wrench.data(), free.data()));
     return time;
   });
 }
@@ -177,6 +188,9 @@ int replay_phase_limit(const Data& data, const Data& record, Replay& replay) {
       bound = limit.step(static_cast<int>(*state), max_wrench);
     });
     replay.compare("bound", t, bound);
+    bool is_lower = false;
+    for (int j = 0; j < 8; ++j) is_lower = is_lower || bound[j] < max_wrench[j];
+    replay.count(is_lower);
     return time;
   });
 }
@@ -192,6 +206,7 @@ int replay_rate_limiter(const Data& data, const Data& record, Replay& replay) {
       limited = limiter.step(desired, pose, is_controlled);
     });
     replay.compare("limited", t, limited);
+    replay.count(differs(limited, desired));
     return time;
   });
 }
@@ -209,6 +224,7 @@ int replay_watchdog(const Data& data, const Data& record, Replay& replay) {
     });
     replay.compare("followed", t, followed);
     replay.compare(*replay.row("timed_out", t), watchdog.has_timed_out());
+    replay.count(watchdog.has_timed_out());
     return time;
   });
 }

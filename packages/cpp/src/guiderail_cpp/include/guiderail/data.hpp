@@ -5,7 +5,6 @@
 #include <cstdint>
 #include <cstring>
 #include <fstream>
-#include <iterator>
 #include <map>
 #include <stdexcept>
 #include <string>
@@ -31,7 +30,12 @@ class Data {
   explicit Data(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     if (!file) throw std::runtime_error(path + " cannot be read: name the file skill.safetensors of an exported skill");
-    buffer_.assign(std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>());
+    file.seekg(0, std::ios::end);
+    const std::streamoff bytes = file.tellg();
+    if (bytes < 0) fail(path);
+    buffer_.resize(static_cast<std::size_t>(bytes));
+    file.seekg(0);
+    if (!file.read(buffer_.data(), bytes)) fail(path);
     std::uint64_t length = 0;
     if (buffer_.size() >= 8) std::memcpy(&length, buffer_.data(), 8);
     if (buffer_.size() < 8 || length > buffer_.size() - 8) fail(path);
@@ -48,6 +52,13 @@ class Data {
     const auto found = tensors_.find(name);
     if (found == tensors_.end()) throw std::runtime_error("the data of the skill lack the array " + name);
     return found->second;
+  }
+
+  // Array of a shape; throws std::runtime_error if it is missing or has another one.
+  const Tensor& get(const std::string& name, const std::vector<std::size_t>& shape) const {
+    const Tensor& tensor = get(name);
+    if (tensor.shape != shape) throw std::runtime_error("the array " + name + " of the skill has another shape: export the skill again");
+    return tensor;
   }
 
   double number(const std::string& name) const { return get(name).values.at(0); }
@@ -129,7 +140,11 @@ class Data {
            const std::vector<std::size_t>& offsets, const std::string& path) {
     const std::size_t width = type == "F64" ? 8 : type == "F32" ? 4 : 0;
     std::size_t count = 1;
-    for (std::size_t size : shape) count *= size;
+    for (std::size_t size : shape) {
+      if (size > buffer_.size()) fail(path);  // before the product can overflow
+      count *= size;
+      if (count > buffer_.size()) fail(path);
+    }
     const bool is_inside = width > 0 && offsets.size() == 2 && offsets[1] >= offsets[0] &&
                            offsets[1] - offsets[0] == count * width && offsets[1] <= buffer_.size() - start_;
     if (!is_inside) fail(path);

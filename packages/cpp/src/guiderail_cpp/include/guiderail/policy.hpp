@@ -22,9 +22,14 @@ class Policy {
       const Tensor& bias = data.get("policy/bias_" + std::to_string(i));
       layers_.push_back({std::vector<float>(weight.values.begin(), weight.values.end()), bias.values,
                          static_cast<int>(weight.dim(0)), static_cast<int>(weight.dim(1))});
+      const std::size_t into = i == 0 ? weight.dim(1) : layers_[layers_.size() - 2].bias.size();
+      if (weight.shape != std::vector<std::size_t>{bias.size(), into} || bias.shape.size() != 1 || weight.size() == 0)
+        throw std::runtime_error("the layers of the policy do not fit each other");
       widest = std::max({widest, weight.dim(0), weight.dim(1)});
     }
     if (layers_.empty()) throw std::runtime_error("the data of the skill have no policy");
+    if (low_.size() != layers_.back().bias.size() || high_.size() != low_.size())
+      throw std::runtime_error("the limits of the action do not fit the policy");
     first_.resize(widest), second_.resize(widest), action_.resize(low_.size());
   }
 
@@ -94,20 +99,25 @@ class Observation {
  public:
   explicit Observation(const Data& data)
       : entries_(data.get("observation/entries")), sizes_(data.get("observation/sizes")), values_(entries_.dim(0)) {
+    if (entries_.size() != 5 * values_.size()) throw std::runtime_error("an entry of the observation has five numbers");
     std::size_t at = 0;
     for (std::size_t i = 0; i < sizes_.size(); ++i) {
+      if (!(sizes_[i] >= 1 && sizes_[i] <= 1e6)) throw std::runtime_error("a signal of the observation has at least one number");
       names_.push_back(data.text("signal_" + std::to_string(i)));
       starts_.push_back(at);
       at += static_cast<std::size_t>(sizes_[i]);
     }
     signals_.assign(std::max<std::size_t>(at, 1), 0.0);
     for (std::size_t i = 0; i < values_.size(); ++i) {
+      if (!(entries_[5 * i] >= 0 && entries_[5 * i] <= 1e6 && entries_[5 * i + 1] >= 0 && entries_[5 * i + 1] <= 1e6))
+        throw std::runtime_error("an entry of the observation is outside of its signal");
       const auto signal = static_cast<std::size_t>(entries_[5 * i]);
       indices_.push_back(starts_.at(signal) + static_cast<std::size_t>(entries_[5 * i + 1]));
       if (indices_.back() >= at) throw std::runtime_error("an entry of the observation is outside of its signal");
     }
   }
 
+  int count() const { return static_cast<int>(values_.size()); }  // number of entries
   const std::vector<std::string>& names() const { return names_; }
 
   // Place of a signal's numbers, to be written before each step; nullptr if the policy does not observe the signal.

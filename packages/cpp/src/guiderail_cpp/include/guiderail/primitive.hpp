@@ -53,6 +53,13 @@ class Constraints {
     enter(output, at, step);
   }
 
+  // Throws std::runtime_error if the arrays do not fit each other and the outputs.
+  void check(const Data& data, int outputs) const {
+    const std::vector<std::size_t> shape = data.get("constraints/G").shape;
+    if (shape.size() != 3 || shape[0] == 0 || outputs_ != outputs) throw std::runtime_error("the constraints do not fit the outputs");
+    data.get("constraints/c", {shape[0], shape[1]}), data.get("constraints/interior", {shape[0], shape[2]});
+  }
+
  private:
   int clipped(int step) const { return std::min(std::max(step, 0), steps_ - 1); }
   const double* G(int at) const { return G_.data() + static_cast<std::size_t>(at) * rows_ * outputs_; }
@@ -105,6 +112,7 @@ class Primitive {
         scaling_(static_cast<std::size_t>(steps_) * directions_ + 1), x_(inputs_), output_(outputs_), last_(outputs_),
         free_(directions_ + 1), lower_(directions_ + 1), upper_(directions_ + 1), v_(width_ + 1),
         constraints_(data), solver_(directions_ + 1, width_ + 1) {
+    check(data);
     for (int n = 0; n < steps_; ++n) {
       const std::size_t first = static_cast<std::size_t>(n) * directions_;
       normalize_rows(rows_.data() + first * width_, scaling_.data() + first, directions_, static_cast<int>(rank_[n]), width_);
@@ -156,6 +164,22 @@ class Primitive {
   int iterations() const { return is_constrained_ ? solver_.iterations() : 0; }
 
  private:
+  // Throws std::runtime_error if the arrays do not fit each other.
+  void check(const Data& data) const {
+    const auto size = [](int value) { return static_cast<std::size_t>(value); };
+    const std::size_t N = size(steps_), O = size(outputs_), I = size(inputs_), m = size(directions_), r = size(width_);
+    data.get("primitive/output_map", {N, O, I}), data.get("primitive/output_offset", {N, O});
+    data.get("primitive/constraint_map", {N, m, I}), data.get("primitive/correction_map", {N, O, r});
+    data.get("primitive/constraint_rows", {N, m, r}), data.get("primitive/rank", {N});
+    for (const char* name : {"lower", "upper", "scale"}) data.get(std::string("primitive/") + name, {N, m});
+    for (const char* name : {"initial_command", "first_mean"}) data.get(std::string("primitive/") + name, {O});
+    data.get("primitive/gain", {O, size(actions_)});
+    for (double rank : rank_.values)
+      if (!(rank >= 0 && rank <= width_)) throw std::runtime_error("the rank of a step is outside of its rows");
+    if (N == 0 || O == 0 || I < O || I % O != 0) throw std::runtime_error("the primitive has no step, or its history does not fit its outputs");
+    constraints_.check(data, outputs_);
+  }
+
   // Stores an output in the history. Of the angles (a, b, c) and (a + pi, pi - b, c + pi) of a pose's orientation, each
   // plus full turns, it stores those nearest to the angles of `near`.
   void store(const double* output, const double* near, int at) {

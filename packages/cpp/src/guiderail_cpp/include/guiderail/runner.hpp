@@ -20,6 +20,7 @@ struct RunnerSettings {
   double update_period = 0.001;                           // period of the updates [s]
   double max_speed = 0.25, max_angular_speed = 1.5;       // limits of the target [m/s, rad/s]
   double timeout = 0.1;                                   // age above which a measurement is stale [s]
+  double max_tool_speed = 2.0, max_tool_angular_speed = 10.0;  // a measured pose that moved faster is none [m/s, rad/s]
   bool bounds_force = true;  // move the target towards the tool so that the force stays inside the skill's bound
 };
 
@@ -30,7 +31,7 @@ inline const char* describe(RunnerState state) {
     case RunnerState::kIdle: return "idle";
     case RunnerState::kRunning: return "running";
     case RunnerState::kFinished: return "finished: the last target is held";
-    case RunnerState::kStale: return "measurements are stale, or no pose and wrench: the last target is held";
+    case RunnerState::kStale: return "measurements are stale, impossible, or no pose and wrench: the last target is held";
     default: return "a safe pose is commanded instead of the requested one";
   }
 }
@@ -65,7 +66,7 @@ class Runner {
     wrench_slot_ = skill_.signal("wrench"), wrench_size_ = skill_.signal_size("wrench");
     if (skill_.outputs() != 6) throw std::runtime_error("a skill on a robot commands poses of six coordinates");
     if (!is_pose(settings.task_frame.data())) throw std::runtime_error("the task frame is no pose with a quaternion of norm one");
-    for (double value : {settings.max_speed, settings.max_angular_speed, settings.timeout})
+    for (double value : {settings.max_speed, settings.max_angular_speed, settings.timeout, settings.max_tool_speed, settings.max_tool_angular_speed})
       if (!(value > 0 && std::isfinite(value))) throw std::runtime_error("limits of speed and timeout are positive numbers");
     if (!(settings.update_period > 0 && settings.update_period <= skill_.period() + 1e-9))
       throw std::runtime_error("the update period is positive, and at most the skill's period");
@@ -87,19 +88,21 @@ class Runner {
     limiter_.start(pose_.data());
     desired_ = last_pose_ = pose_;
     velocity_.fill(0.0);
-    elapsed_ = 0.0, skill_time_ = 0.0, violation_ = 0.0, fallbacks_ = 0;
+    elapsed_ = 0.0, since_pose_ = 0.0, skill_time_ = 0.0, violation_ = 0.0, fallbacks_ = 0;
     to_base(pose_.data());
     state_ = RunnerState::kRunning;
     return true;
   }
 
   // Computes the target (7,) of an update `period` [s] after the last one, for the measured pose (7,) in the base and
-  // wrench (6,), and their age [s]. While they are stale or no numbers, the last target is held, and the skill waits. A
-  // late update does not make the skill faster: it never takes more than one step in an update.
+  // wrench (6,), and their age [s]. While they are stale, no numbers, or a pose that the tool cannot have reached, the last
+  // target is held, and the skill waits: a target beside a wrong pose would move the tool. A late update does not make
+  // the skill faster: it never takes more than one step in an update.
   const double* update(double period, const double* measured, const double* wrench, double age) {
     if (state_ == RunnerState::kIdle) return target_.data();
+    since_pose_ += period >= 0 ? period : 0.0;
     const bool is_stale = !(age <= settings_.timeout) || !(period >= 0) || !is_pose(measured) || !is_finite(wrench, 6);
-    if (is_stale) {
+    if (is_stale || !is_reachable(measured)) {
       state_ = RunnerState::kStale;
       return target_.data();
     }
@@ -108,6 +111,7 @@ class Runner {
     const std::array<double, 6> moved = pose_difference(pose_.data(), last_pose_.data());
     for (int i = 0; i < 6; ++i) velocity_[i] = period > 0 ? moved[i] / period : 0.0;
     last_pose_ = pose_;
+    since_pose_ = 0.0;
     if (skill_.is_over()) {
       state_ = RunnerState::kFinished;
     } else if (elapsed_ + 1e-9 >= skill_time_) {
@@ -137,6 +141,14 @@ class Runner {
  private:
   void to_task(const double* measured, double* pose) const { transform_to_pose(X_TBase_ * quaternion_to_transform(measured), pose); }
 
+  // True if the tool can have moved to a measured pose (7,) since the last one, at most the timeout ago: after a larger
+  // jump, the last target is held until the next start.
+  bool is_reachable(const double* measured) const {
+    const double time = std::min(since_pose_, settings_.timeout) + settings_.update_period;
+    const Transform X = X_TBase_ * quaternion_to_transform(measured), last = pose_to_transform(last_pose_.data());
+    return norm(X.p - last.p) <= settings_.max_tool_speed * time && angle_between(X.R, last.R) <= settings_.max_tool_angular_speed * time;
+  }
+
   void to_base(const double* pose) {
     const Transform X = X_BaseT_ * pose_to_transform(pose);
     const std::array<double, 4> q = quaternion(X.R);
@@ -158,7 +170,7 @@ class Runner {
   RunnerState state_ = RunnerState::kIdle;
   std::array<double, 6> pose_{}, desired_{}, last_pose_{}, velocity_{}, reference_{};
   std::array<double, 7> target_{0, 0, 0, 0, 0, 0, 1};
-  double elapsed_ = 0, skill_time_ = 0, violation_ = 0;
+  double elapsed_ = 0, since_pose_ = 0, skill_time_ = 0, violation_ = 0;
   long fallbacks_ = 0;
   double* wrench_slot_ = nullptr;
   int wrench_size_ = 0;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <memory>
 #include <optional>
 #include <string>
@@ -37,8 +38,15 @@ class Skill {
     pose_ = observation_.signal("pose"), desired_pose_ = observation_.signal("desired_pose");
     wrench_ = observation_.size("wrench") == 6 ? observation_.signal("wrench") : nullptr;
     pressure_ = observation_.signal("center_of_pressure"), min_force_ = data.number("observation/min_force");
-    if (pressure_ && observation_.size("center_of_pressure") != 2) throw std::runtime_error("a center of pressure is two numbers");
+    contact_ = observation_.signal("mean_contact_point"), max_samples_ = data.number("observation/contact_samples");
+    for (const char* name : {"center_of_pressure", "mean_contact_point"})
+      if (observation_.signal(name) && observation_.size(name) != 2) throw std::runtime_error("a point of contact is two numbers");
+    if (contact_ && outputs() < 2) throw std::runtime_error("a mean point of contact needs a position");
     state_ = observation_.signal("state"), distance_ = observation_.signal("transition_distance");
+    if (policy_.inputs() != observation_.count()) throw std::runtime_error("the observation does not fit the policy");
+    if (!(period_ > 0 && std::isfinite(period_) && std::isfinite(duration_) && action_repeat_ >= 1))
+      throw std::runtime_error("the period, the duration or the repetition of actions of the skill is invalid");
+    if (std::max(pose_size_, desired_size_) > outputs()) throw std::runtime_error("the observed pose does not fit the guidance");
     const int actions = primitive_ ? primitive_->actions() : template_->actions();
     if (actions != policy_.outputs()) throw std::runtime_error("the policy's action does not fit the guidance");
   }
@@ -56,8 +64,8 @@ class Skill {
   const std::vector<std::string>& signals() const { return observation_.names(); }
 
   // Place of a signal that the policy observes, to be written before each step; nullptr if it does not observe it. The
-  // signals time, phase, pose, desired_pose, state and transition_distance, and center_of_pressure if the whole wrench is
-  // observed, are written by the skill itself.
+  // signals time, phase, pose, desired_pose, state and transition_distance, and center_of_pressure and mean_contact_point if
+  // the whole wrench is observed, are written by the skill itself.
   double* signal(const std::string& name) { return observation_.signal(name); }
   int signal_size(const std::string& name) const { return observation_.size(name); }
 
@@ -68,7 +76,7 @@ class Skill {
 
   // Begins an episode at a measured pose (O,).
   void start(const double* pose) {
-    steps_ = 0;
+    steps_ = 0, samples_ = mean_[0] = mean_[1] = 0.0;
     std::fill(held_.begin(), held_.end(), 0.0);
     if (phase_limit_) phase_limit_->start();
     if (primitive_) {
@@ -95,11 +103,14 @@ class Skill {
         pressure_[0] = is_reliable ? -wrench_[4] / wrench_[2] : 0.0;
         pressure_[1] = is_reliable ? wrench_[3] / wrench_[2] : 0.0;
       }
+      if (contact_ && wrench_)
+        for (int i = 0; i < 2; ++i) contact_[i] = samples_ > 0.0 ? mean_[i] - pose[i] : 0.0;
       if (state_ && template_) *state_ = template_->state();
       if (distance_ && template_) *distance_ = template_->transition_distance();
       const double* action = policy_(observation_.values());
       std::copy_n(action, held_.size(), held_.begin());
     }
+    if (contact_ && wrench_) remember(pose);
     return guide(held_.data(), pose);
   }
 
@@ -118,6 +129,16 @@ class Skill {
     return command;
   }
 
+  // Adds the point of contact to the mean, if force and pose are finite and the force is reliable.
+  void remember(const double* pose) {
+    const auto is_finite = [](double value) { return std::isfinite(value); };
+    const bool is_usable = std::all_of(wrench_, wrench_ + 6, is_finite) && std::all_of(pose, pose + outputs(), is_finite);
+    if (!is_usable || wrench_[2] < min_force_) return;
+    samples_ = std::min(samples_ + 1.0, max_samples_);
+    const double pressure[2] = {-wrench_[4] / wrench_[2], wrench_[3] / wrench_[2]};
+    for (int i = 0; i < 2; ++i) mean_[i] += (pose[i] + pressure[i] - mean_[i]) / samples_;
+  }
+
   Policy policy_;
   Observation observation_;
   double period_, duration_;
@@ -127,8 +148,8 @@ class Skill {
   std::optional<Governor> governor_;
   std::optional<PhaseWrenchLimit> phase_limit_;
   std::vector<double> held_, desired_;
-  double *time_, *phase_, *pose_, *desired_pose_, *state_, *distance_, *wrench_, *pressure_;
-  double min_force_;
+  double *time_, *phase_, *pose_, *desired_pose_, *state_, *distance_, *wrench_, *pressure_, *contact_;
+  double min_force_, max_samples_, samples_ = 0.0, mean_[2] = {0.0, 0.0};
   int pose_size_, desired_size_;
   long steps_ = 0;
 };

@@ -159,6 +159,7 @@ class Template {
     Reader reader(data.get(prefix + "states"));
     for (int n = reader.whole(); n > 0; --n) states_.emplace_back(reader);
     const Tensor& poses = data.get(prefix + "frames");
+    check(poses);
     for (std::size_t i = 0; i < frames_.size(); ++i) set_frame(static_cast<int>(i), poses.data() + 6 * i);
     std::size_t most = 0;
     for (const State& state : states_) most = std::max(most, state.constraints.size());
@@ -170,9 +171,9 @@ class Template {
   int initial_state() const { return initial_; }
   int frames() const { return static_cast<int>(frames_.size()); }
 
-  // Moves the frame of an object to a pose (6,); a pose that is not finite is ignored.
+  // Moves the frame of an object to a pose (6,); a pose that is not finite, or of no frame, is ignored.
   void set_frame(int index, const double* pose) {
-    if (is_finite(pose, 6)) frames_[index] = pose_to_transform(pose);
+    if (index >= 0 && index < frames() && is_finite(pose, 6)) frames_[index] = pose_to_transform(pose);
   }
 
   // Requested pose: the displacement of one period for inputs (n,), applied to a pose.
@@ -527,6 +528,40 @@ class Template {
         return;
       }
       default: return;
+    }
+  }
+
+  // Throws std::runtime_error if a number refers to nothing, or a part has too few numbers.
+  void check(const Tensor& poses) const {
+    static constexpr std::size_t kConstraint[] = {4, 6, 2, 2, 1, 3, 9, 12, 10, 13, 5, 9, 7, 4}, kDistance[] = {3, 0, 0, 11, 9};
+    const auto require = [](bool condition) {
+      if (!condition) throw std::runtime_error("the template of the skill is damaged: export the skill again");
+    };
+    const auto is_of = [](auto kind, std::size_t kinds) { return static_cast<int>(kind) >= 0 && static_cast<std::size_t>(kind) < kinds; };
+    const auto check_frame = [&](int frame) { require(frame >= kTool && frame < frames()); };
+    require(poses.size() == 6 * frames_.size() && inputs_ >= 1 && inputs_ <= kMaxInputs && initial_ >= 0 && initial_ < states());
+    for (const State& state : states_) {
+      require(state.max_speed > 0 && state.max_angular_speed > 0);
+      for (const Mapping& mapping : state.mappings) {
+        require(is_of(mapping.kind, 3));
+        check_frame(mapping.frame);
+        for (int input : mapping.inputs) require(input >= 0 && input < inputs_);
+        const bool is_tilt = mapping.kind == MappingKind::kTiltTowards;
+        require(is_tilt ? mapping.inputs.size() == 2 : mapping.axes.size() == 3 * mapping.inputs.size());
+        for (const Mapping::Scaling& scaling : mapping.scalings) {
+          check_frame(scaling.frame);
+          require(scaling.is_uneven || (!scaling.distances.empty() && scaling.distances.size() == scaling.factors.size()));
+        }
+      }
+      for (const Constraint& constraint : state.constraints) {
+        require(is_of(constraint.kind, 14) && constraint.numbers.size() >= kConstraint[static_cast<int>(constraint.kind)]);
+        check_frame(constraint.frame);
+        require(constraint.kind != ConstraintKind::kKeepAbove || constraint.xs.size() % 3 == 0);
+        require(constraint.kind != ConstraintKind::kTiltByDistance || (!constraint.xs.empty() && constraint.xs.size() == constraint.ys.size()));
+      }
+      require(is_of(state.distance.kind, 5) && state.distance.numbers.size() >= kDistance[static_cast<int>(state.distance.kind)]);
+      check_frame(state.distance.frame);
+      for (const Exit& exit : state.exits) require(exit.source >= 0 && exit.source < states() && exit.target >= 0 && exit.target < states());
     }
   }
 

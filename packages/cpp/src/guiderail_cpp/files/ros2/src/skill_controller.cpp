@@ -1,7 +1,16 @@
 // Controller of ros2_control that runs a skill: state interfaces of a pose and a wrench, command interfaces of a target.
 //
 // The target goes to the reference interfaces of a chained Cartesian controller. Parameters are listed in
-// config/skill_controller.yaml.
+// config/skill_controller.yaml. The interfaces, in their order:
+//
+//   pose_interfaces    7  measured pose of the tool center in the robot's base: position x y z [m], quaternion x y z w
+//   wrench_interfaces  6  wrench of the surroundings on the tool, about the tool center: force [N], torque [Nm], in the axes
+//                         of the base, or of the tool if wrench_in_tool is true
+//   target_interfaces  7  target of the tool center in the robot's base, as the measured pose
+//
+// update() neither allocates, throws, locks nor logs, and its time is bounded. If a measurement is not finite, no pose, or a
+// pose that the tool cannot have reached, it keeps the last target and returns ERROR. State interfaces have no time stamp:
+// a sensor that repeats its last value is not noticed here, and the hardware component has to report it.
 #include <array>
 #include <chrono>
 #include <memory>

@@ -1,5 +1,16 @@
 // Lifecycle node that runs a skill between topics: a measured pose and wrench in, targets of a Cartesian controller and
 // diagnostics out.
+//
+//   current_pose     PoseStamped      measured pose of the tool center in the robot's base [m], quaternion
+//   external_wrench  WrenchStamped    wrench of the surroundings on the tool, about the tool center [N, Nm], in the axes of
+//                                     the base, or of the tool if wrench_in_tool is true
+//   target_pose      PoseStamped      target of the tool center, in the frame of current_pose
+//   /diagnostics     DiagnosticArray  state of the skill, once per 50 targets
+//
+// Parameters: skill (path), task_frame (frame of the skill's poses in the base, [x y z qx qy qz qw]), wrench_in_tool,
+// max_speed [m/s], max_angular_speed [rad/s], timeout [s] after which a measurement is stale, bound_force, update_rate [Hz].
+// If measurements are stale or impossible, the last target is sent again. Messages are allocated: use the controller
+// where the time of an update must be bounded.
 #pragma once
 
 #include <array>
