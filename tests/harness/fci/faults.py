@@ -18,8 +18,8 @@ from drake import lcmt_iiwa_status
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from fci.simulated_franka import SimulatedRun
-from injections.campaign import DURATION, GROWTH, MAX_STEPS, SLOW, SLOW_AFTER, has_effect
-from injections.kinds import KINDS, PERIOD, Fault, Kind
+from injections.campaign import DURATION, MAX_STEPS, SLOW, SLOW_AFTER, has_effect
+from injections.kinds import GROWTH, KINDS, PERIOD, Fault, Kind
 
 from guiderail.models.control import joint_status
 from guiderail_hardware.drivers.fci import FciDriver

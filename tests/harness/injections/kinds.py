@@ -22,6 +22,8 @@ FIELDS = lcmt_iiwa_status.__slots__[2:]
 
 Fault = Callable[[bytes, float], list[bytes]]
 
+GROWTH = 1.25  # largest joint speed after a fault, relative to the speed at the fault or of the undisturbed motion
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -49,7 +51,7 @@ class Kind:
     where: str = "sensor"
     action: tuple[str, str] = ("", "")
     delays_heartbeats: bool = False
-    growth: float = 1.25
+    growth: float = GROWTH
     situation: str = "motion"
     change: Callable[[Any], None] | None = None
 
@@ -486,7 +488,7 @@ KINDS = (
             (25, 13 * PERIOD),
             (30, 14 * PERIOD),
             (45, HEARTBEAT),
-            (60, HEARTBEAT),
+            (60, TIMEOUT),
         )
     ),
     Kind("statuses reversed, groups of 8", 10 * PERIOD, _reversed_groups(8), "network"),

@@ -70,7 +70,7 @@ class Listener:
         self.commands.append((time.monotonic(), float(np.abs(torque).max())))
 
     def _heartbeat(self, message: bytes) -> None:
-        _, is_stopping, sender = HEARTBEAT_FORMAT.unpack(message)
+        _, is_stopping, sender, _ = HEARTBEAT_FORMAT.unpack(message)
         self.is_stopping[sender] = is_stopping
         if is_stopping:
             self.stop_times.append(self.clock)

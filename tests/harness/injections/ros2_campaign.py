@@ -50,9 +50,9 @@ from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
-from injections.campaign import DURATION, GROWTH, MAX_STEPS, SLOW, SLOW_AFTER, Result, has_effect, print_table
+from injections.campaign import DURATION, MAX_STEPS, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
-from injections.kinds import FIELDS, KINDS, NEXT, PERIOD, UNDETECTED, Kind
+from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind
 
 RADIUS, ROTATION, FREQUENCY = 0.01, 0.15, 1.0  # amplitudes and frequency of the motion [m], [rad], [Hz]
 BANDWIDTH = 60.0  # natural frequency of the critically damped arm [rad/s]
@@ -75,8 +75,8 @@ OTHER_ROBOTS = ("second robot", "moving robot")
 
 
 def _is_latency(kind: Kind) -> bool:
-    """Return True for a fault that delays all messages by the same time."""
-    return kind.name.endswith("ms late for ever")
+    """Return True for a fault that delays all messages by the same time, without a gap that is a timeout."""
+    return kind.name.endswith(" ms late") and kind.name != "statuses 60 ms late"
 
 
 def _lossy(rng: np.random.Generator):
@@ -104,7 +104,7 @@ OWN_KINDS = (
 # constant latency, because the loop of forces is closed at the robot.
 SILENT = ("commands lost", "controller killed", "controller stopped")
 CAMPAIGN = [
-    replace(kind, bound=UNDETECTED) if kind.name in (*SILENT, "commands 60 ms late") or _is_latency(kind) else kind
+    replace(kind, bound=UNDETECTED) if kind.name in SILENT or _is_latency(kind) else kind
     for kind in (*KINDS, *OWN_KINDS)
     if kind.name not in WITHOUT_DECODING and kind.action[1] != "monitor" and not kind.name.startswith(WITHOUT_TORQUES)
 ]
