@@ -16,15 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import Observed
 from guiderail.diagrams.envs.options import STANDARD, Integer, Number
-from guiderail.diagrams.envs.scene import (
-    ARM_VIEW,
-    TOOL_VIEW,
-    Scene,
-    box_edges,
-    front_camera,
-    in_frame,
-    viewpoint,
-)
+from guiderail.diagrams.envs.scene import ARM_VIEW, TOOL_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
@@ -32,16 +24,17 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
-    COLLISION_FORCE,
     COMMAND_SCALE,
-    FORCE_LIMITS,
     HISTORY_VARIANCE,
     NEGLIGIBLE_OFFSET,
     REPEATABILITY_STD,
-    FixtureOffsetOptions,
     HiddenOffsets,
-    PriorOptions,
+    PriorStd,
+    force_limit_field,
+    friction_field,
     in_ring,
+    length_field,
+    prior_std_field,
     reference_of_file,
 )
 from guiderail.diagrams.tasks.registry import register_task
@@ -307,7 +300,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 
 
 @register_task("BncConnector")
-class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
+class BncConnector(DemonstratedInsertion):
     """Insert, align and lock the connector.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28); "shaped" and "aligned" add terms to it.
@@ -323,29 +316,24 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
         "state", description="name of the observation"
     )
 
-    start_offset_max: Number = Field(
-        0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"
+    start_offset_max: Number = length_field(0.0, 0.0, ALIGNMENT, "largest sampled offset of the start along x and y")
+    bound: Number = length_field(ALIGNMENT, 0.5 * MM, 6.0 * MM, "bound of a command's |x| and |y|")
+    force_limit: Number = force_limit_field(5)
+    mouth_chamfer: Number = length_field(
+        NOMINAL.mouth_chamfer, 0.05 * MM, 0.6 * MM, "chamfer of the plug's mouth and slots"
     )
-    bound: Number = Field(ALIGNMENT, ge=0.5 * MM, le=6.0 * MM, description="bound of a command's |x| and |y| [m]")
-    force_limit: Number = Field(
-        COLLISION_FORCE, ge=5, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
+    bore_clearance: Number = length_field(
+        NOMINAL.bore_clearance, 0.05 * MM, 0.2 * MM, "clearance between barrel and bore on each side"
     )
-    mouth_chamfer: Number = Field(
-        NOMINAL.mouth_chamfer, ge=0.05 * MM, le=0.6 * MM, description="chamfer of the plug's mouth and slots [m]"
-    )
-    bore_clearance: Number = Field(
-        NOMINAL.bore_clearance,
-        ge=0.05 * MM,
-        le=0.2 * MM,
-        description="clearance between barrel and bore on each side [m]",
-    )
-    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
+    friction: Number = friction_field(FRICTION, "the connector's metal")
     demonstrations: str = Field(
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )
     num_demonstrations: Integer | None = Field(
         None, ge=1, description="number of demonstrations to use, from the first on; a single one needs prior_std"
     )
+
+    prior_std: PriorStd | None = prior_std_field()
 
     @field_validator("demonstrations")
     @classmethod

@@ -37,8 +37,7 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    FixtureOffsetOptions,
-    ForceOptions,
+    length_field,
 )
 from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
 from guiderail.diagrams.wiring import add_system
@@ -151,37 +150,10 @@ COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale 
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
-class PartOptions(FixtureOffsetOptions, ForceOptions):
-    """Options of a task of two meshes."""
-
-    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
-    observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
-        "state", description="name of the observation"
-    )
-
-    offset_shape: Literal["ring", "square"] = Field(
-        "ring",
-        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
-        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
-    )
-    fixture_turn: Number = Field(
-        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
-    )
-    bound: Number | None = Field(
-        None,
-        ge=0.5 * MM,
-        le=6.0 * MM,
-        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
-    )
-    start_offset_max: Number = Field(
-        0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
-    )
-
-
 class PartUncertainty(BncUncertainty):
     """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square."""
 
-    def __init__(self, options: PartOptions):
+    def __init__(self, options: PartInsertion):
         super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
         self.is_square = options.offset_shape == "square"
 
@@ -251,7 +223,7 @@ class ScriptedSearch:
         return self._action.copy()
 
 
-class PartInsertion(PartOptions, DemonstratedInsertion):
+class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
@@ -265,6 +237,27 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
     simulated_rewards = ("aligned",)
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]  # content of `task.yaml`
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
+        "state", description="name of the observation"
+    )
+
+    offset_shape: Literal["ring", "square"] = Field(
+        "ring",
+        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
+        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
+    )
+    fixture_turn: Number = Field(
+        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
+    )
+    bound: Number | None = Field(
+        None,
+        ge=0.5 * MM,
+        le=6.0 * MM,
+        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
+    )
+    start_offset_max: Number = length_field(0.0, 0.0, 2.0 * MM, "largest sampled offset of the start along x and y")
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
