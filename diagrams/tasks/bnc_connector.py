@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import Observed
-from guiderail.diagrams.envs.options import STANDARD, Integer, Number
+from guiderail.diagrams.envs.options import Integer, Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, TOOL_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -38,7 +38,7 @@ from guiderail.diagrams.tasks.options import (
     reference_of_file,
 )
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
+from guiderail.diagrams.tasks.task import Condition
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
@@ -309,6 +309,8 @@ class BncConnector(DemonstratedInsertion):
     workpiece, fixture = "plug", "jack"
     simulated_rewards = ("aligned",)
     presets = {"hard": HARD}
+    scripted_policies = (scripted_torque_search, scripted_center_of_pressure)
+    scripted_defaults = {"hard": scripted_center_of_pressure}
     defaults = {"guidance": "skgrl", "action_repeat": 10, "action_dims": (0, 1), "history.variance": HISTORY_VARIANCE}
 
     reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
@@ -408,12 +410,6 @@ class BncConnector(DemonstratedInsertion):
         half = Symmetry.of_signs(observation, HALF_TURN, (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH))
         more = len(self.force_limit_terms())
         return half.pad(more), Symmetry(*sides_of_the_rim(self.observation)).pad(more)
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
-        return {policy.__name__: policy for policy in (default, scripted_torque_search, scripted_center_of_pressure)}
 
     def scene(self) -> Scene:
         """Return the demonstrations, the box of the alignment constraint and a camera that looks down at the jack."""

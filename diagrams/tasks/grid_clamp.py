@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed
-from guiderail.diagrams.envs.options import STANDARD, Number, Pair, increases
+from guiderail.diagrams.envs.options import Number, Pair, increases
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
@@ -22,7 +22,7 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import PRIVILEGED, InsertionTask
 from guiderail.diagrams.tasks.options import HiddenOffsets, force_limit_field, friction_field, in_ring, length_field
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy, terminal_reward
+from guiderail.diagrams.tasks.task import Condition, terminal_reward
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp import (
@@ -262,6 +262,8 @@ class GridClamp(InsertionTask):
     simulated_rewards = ("aligned",)
     snaps_in = True
     presets = {"hard": HARD}
+    scripted_policies = (scripted_search, scripted_gentle_search, straight_descent)
+    scripted_defaults = {"hard": scripted_gentle_search}
     defaults = {"guidance": "sct", "action_repeat": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 
@@ -348,13 +350,6 @@ class GridClamp(InsertionTask):
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        default = scripted_gentle_search if difficulty == "hard" else scripted_search
-        policies = (default, scripted_search, scripted_gentle_search, straight_descent)
-        return {policy.__name__: policy for policy in policies}
 
     def scene(self) -> Scene:
         """Return the cuboid that bounds commands, up to 25 mm above the target, and a camera at the holes."""

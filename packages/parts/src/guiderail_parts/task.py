@@ -17,7 +17,7 @@ from pydrake.systems.primitives import Multiplexer
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed, affine
-from guiderail.diagrams.envs.options import STANDARD, Number
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.guidance.prior import Prior
@@ -39,7 +39,7 @@ from guiderail.diagrams.tasks.options import (
     HISTORY_VARIANCE,
     length_field,
 )
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
+from guiderail.diagrams.tasks.task import Condition
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
@@ -176,6 +176,8 @@ class ScriptedSearch:
     and changes during the motion.
     """
 
+    __name__ = "scripted_search"
+
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
         """Construct the policy.
 
@@ -309,16 +311,6 @@ class PartInsertion(DemonstratedInsertion):
     def _workcell(self) -> PartWorkcell:
         return write_workcell(self.folder, self.file)
 
-    @classmethod
-    def supports(cls, station: str) -> bool:
-        """Return True for every station, except that MuJoCo needs convex pieces."""
-        return cls.file.is_convex or station != "mujoco"
-
-    @classmethod
-    def folder_digest(cls) -> str:
-        """Return the digest of the task folder; see `task_folder_digest`."""
-        return task_folder_digest(cls.folder)
-
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the folder's demonstrations."""
         return self.file.demonstrations.reference(self.folder)
@@ -371,12 +363,6 @@ class PartInsertion(DemonstratedInsertion):
             if direction[0] * x + direction[1] * y >= play + MIN_PUSH:
                 tests.append(HoldTest((x, y, 0.0), play + MAX_HOLD_MOTION))
         return tests
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted search by the center of pressure."""
-        reference = partial(cls.file.demonstrations.reference, cls.folder)
-        return {"scripted_search": ScriptedSearch(cls.file, lambda: reference().num_steps * CONTROL_PERIOD)}
 
     def observe(self) -> Observed:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
@@ -553,10 +539,14 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "time_step": file.time_step,
         **file.recommended.environment,
     }
+    reference = partial(file.demonstrations.reference, folder)
     members = {
         "name": file.name,
+        "scripted_policies": (ScriptedSearch(file, lambda: reference().num_steps * CONTROL_PERIOD),),
+        "unsupported_stations": () if file.is_convex else ("mujoco",),  # MuJoCo needs convex pieces
         "presets": {"hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
+        "digest": content,
         "file": file,
         "defaults": defaults,
         "learner": file.recommended.learner,
