@@ -16,6 +16,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import Law
 from guiderail.models.primitives import UnsolvableError
+from guiderail.models.primitives import fit as selection
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.models.primitives.poses import pose_rotation
 from guiderail.models.templates import load_template
@@ -30,7 +31,7 @@ BOX = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
 
 @pytest.fixture(autouse=True, scope="module")
 def cached_fits():
-    """Fit equal demonstrations only once, because fits take most of the time of these tests."""
+    """Fit equal demonstrations once, and compare few kernels, because fits take most of the time of these tests."""
     original, cache = guide.fit, {}
 
     def fit(recorded, **options):
@@ -41,6 +42,8 @@ def cached_fits():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guide, "fit", fit)
+        patch.setattr(selection, "_LENGTHS", (0.2, 0.06))
+        patch.setattr(selection, "_REGULARIZATIONS", (0.1, 0.01))
         yield
 
 
