@@ -16,7 +16,6 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import Law
 from guiderail.models.primitives import UnsolvableError
-from guiderail.models.primitives import fit as selection
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.models.primitives.poses import pose_rotation
 from guiderail.models.templates import load_template
@@ -27,24 +26,6 @@ TOLERANCE = 1e-9
 ENFORCED = ("kgrl", "skgrl", "clipped_residual")
 RECORDED = demonstrations()
 BOX = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def cached_fits():
-    """Fit equal demonstrations once, and compare few kernels, because fits take most of the time of these tests."""
-    original, cache = guide.fit, {}
-
-    def fit(recorded, **options):
-        key = (*(array.tobytes() for array in (*recorded.times, *recorded.outputs)), repr(options))
-        if key not in cache:
-            cache[key] = original(recorded, **options)
-        return cache[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guide, "fit", fit)
-        patch.setattr(selection, "_LENGTHS", (0.2, 0.06))
-        patch.setattr(selection, "_REGULARIZATIONS", (0.1, 0.01))
-        yield
 
 
 def at_target(env, observation):
