@@ -47,6 +47,8 @@ def test_summaries_tell_robots_apart_more_than_episodes(recorded):
 
 
 def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
+    # A fit uses as many episodes of a draw as were recorded; more would be simulated and not used here.
+    monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", len(load_recordings(recorded / "recordings")))
     sentences = []
     arguments = {
         "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 40,
