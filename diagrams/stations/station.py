@@ -54,7 +54,7 @@ from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.wrench import FORCE_SHARES, POSE_ORDER, WrenchBound, impact_stiffness
+from guiderail.models.control.wrench import FORCE_SHARES, POSE_ORDER, WrenchBound
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
@@ -77,7 +77,6 @@ _FINEST = 2**47  # largest denominator of a time step of which a day's multiples
 
 # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m].
 CONTACT_STIFFNESS = 2.5e4
-MAX_CONTACT_STIFFNESS = 2e5  # largest stiffness for which a limit of the transient force holds [N/m]
 
 
 @dataclass(frozen=True)
@@ -103,26 +102,17 @@ class Impedance:
         if not (np.isfinite(self.damping_ratio) and self.damping_ratio > 0.0):
             raise InputError(f"the impedance's damping_ratio must be positive, not {self.damping_ratio}")
 
-    def with_max_force(self, force: float, transient_force: float | None = None) -> Impedance:
+    def with_max_force(self, force: float) -> Impedance:
         """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
         No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
-        limited for contacts of at most `CONTACT_STIFFNESS`. With `transient_force` [N], it is limited further, so that
-        an impact on a contact of at most `MAX_CONTACT_STIFFNESS` reaches at most this force.
-
-        Raises:
-            InputError: If `transient_force` is below `force`.
+        limited for contacts of at most `CONTACT_STIFFNESS`.
         """
-        stiffness = CONTACT_STIFFNESS
-        if transient_force is not None:
-            if not transient_force >= force:
-                raise InputError(f"the limit of a transient force must be at least {force:g} N, not {transient_force}")
-            stiffness = max(stiffness, impact_stiffness(transient_force / force, MAX_CONTACT_STIFFNESS))
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
         axes = to_wrench_order(limits.tolist())
         norms = (float(np.linalg.norm(axes[:3])), float(np.linalg.norm(axes[3:])))
-        return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, stiffness))
+        return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
 
 
 def max_wrench(force: float) -> np.ndarray:

@@ -142,36 +142,6 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
     return 2.0 * math.sqrt(contact_stiffness * mass)
 
 
-def impact_ratio(stiffness_ratio: float) -> float:
-    """Return the largest contact force of an impact, relative to F, in a contact stiffer than the assumed one.
-
-    With c = 2 √(k m), a mass m that is pushed with F − c |v| and arrives with |v| = F / c follows
-    m x″ + c x′ + r k x = F in a contact of stiffness r k. With ζ = 1 / √r, the first maximum of r k x / F is
-
-        1 + exp(−(π − acos ζ) / √(r − 1)) / (2 ζ),
-
-    and 1 for r ≤ 1. `stiffness_ratio` is r.
-    """
-    if stiffness_ratio <= 1.0:
-        return 1.0
-    ratio = 1.0 / math.sqrt(stiffness_ratio)
-    return 1.0 + math.exp(-(math.pi - math.acos(ratio)) / math.sqrt(stiffness_ratio - 1.0)) / (2.0 * ratio)
-
-
-def impact_stiffness(force_ratio: float, stiffness: float) -> float:
-    """Return the stiffness [N/m] for `approach_impedance` with which impacts reach at most `force_ratio` F.
-
-    The contact is at most as stiff as `stiffness` [N/m]; `force_ratio` is at least 1. See `impact_ratio`.
-    """
-    low, high = 1.0, 4.0 * force_ratio**2 + 1.0  # a ratio r has more than √r / 2 · exp(−π / 2 / √(r − 1))
-    while impact_ratio(high) < force_ratio:
-        high *= 2.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if impact_ratio(middle) <= force_ratio else (low, middle)
-    return stiffness / low
-
-
 def bounded_wrench(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, mass: float, bound: WrenchBound
 ) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
-from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, MAX_CONTACT_STIFFNESS, Impedance
+from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.common.errors import InputError
 
 # The action of `push` ends these episodes by collision if `bounded_force` is false.
@@ -65,17 +65,6 @@ def test_impedance_depends_on_the_force_limit_of_the_task(limit):
     np.testing.assert_array_equal(task.impedance().bound.numbers, expected.bound.numbers)
     assert task.impedance().limits == expected.limits
     assert EnvConfig.resolve("GridClamp", {"bounded_force": False}).declared.impedance() is None
-
-
-def test_limit_of_a_transient_force_lowers_the_approach_speed():
-    """At 1.3 F, a contact of 200 N/mm may be four times as stiff as the assumed one."""
-    options = {"force_limit": 10.0, "transient_force_limit": 13.0}
-    bound = EnvConfig.resolve("GridClamp", options).declared.impedance().bound
-    assert bound.contact_stiffness == pytest.approx(MAX_CONTACT_STIFFNESS / 4.0, rel=0.01)
-    loose = Impedance().with_max_force(10.0, 100.0).bound
-    assert loose.contact_stiffness == Impedance().with_max_force(10.0).bound.contact_stiffness == CONTACT_STIFFNESS
-    with pytest.raises(InputError, match="at least 10 N"):
-        Impedance().with_max_force(10.0, 9.0)
 
 
 @pytest.mark.parametrize("station", ["gantry", "arm", "mujoco"])

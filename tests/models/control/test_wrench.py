@@ -16,8 +16,6 @@ from guiderail.models.control.wrench import (
     clip_wrench,
     damping_share,
     governed_error,
-    impact_ratio,
-    impact_stiffness,
     norm_limits,
     spring_energy,
 )
@@ -187,29 +185,3 @@ def test_change_stores_no_more_than_the_available_energy():
             assert stored - before == pytest.approx(energy - before, rel=1e-6)
         shares.append(share)
     assert 0.2 < np.mean(np.array(shares) == 1.0) < 0.95
-
-
-@pytest.mark.parametrize("ratio", [1.0, 1.01, 2.0, 8.0, 50.0])
-def test_impact_ratio_is_the_peak_force_of_a_simulated_impact(ratio):
-    k, m, F, step = 2.5e4, 1.5, 20.0, 1e-5
-    c = approach_impedance(k, m)
-    x, v = 0.0, F / c
-    for _ in range(20_000):
-        v += step * (F - c * v - ratio * k * x) / m
-        if v <= 0.0:
-            break
-        x += step * v
-    assert impact_ratio(ratio) == pytest.approx(ratio * k * x / F, abs=2e-3)
-
-
-def test_impact_ratio_is_one_in_a_contact_of_the_assumed_stiffness():
-    assert [impact_ratio(ratio) for ratio in (0.0, 0.5, 1.0)] == [1.0] * 3
-
-
-@pytest.mark.parametrize("ratio", [1.05, 1.3, 2.0, 6.0])
-def test_impact_stiffness_is_the_inverse_of_the_impact_ratio(ratio):
-    assert impact_ratio(2e5 / impact_stiffness(ratio, 2e5)) == pytest.approx(ratio)
-
-
-def test_impact_stiffness_is_at_most_that_of_the_contact():
-    assert impact_stiffness(1.0, 2e5) == pytest.approx(2e5, rel=0.01)

@@ -240,6 +240,18 @@ def test_arm_is_not_damped_when_hold_succeeds():
     np.testing.assert_array_equal(arm.torques, np.zeros((1, 7)))  # before the driver holds the arm
 
 
+def test_zero_torque_is_sent_once_after_each_torque_before_a_hold():
+    """A driver that does not hold the arm would repeat its last torque."""
+    driver = HoldingDriver()
+    driver.hold, torques = lambda: True, []
+    driver.write = lambda torque, time: torques.append(torque)
+    for torque in (2.0, 3.0):
+        driver.guard.write(np.full(7, torque), 0.0)
+        driver.guard.hold()
+        driver.guard.hold()
+    np.testing.assert_array_equal(torques, np.outer([2.0, 0.0, 3.0, 0.0], np.ones(7)))
+
+
 @pytest.mark.parametrize("answer", [True, None])
 def test_arm_is_damped_when_hold_has_no_effect(answer):
     arm = MovingArm(HoldingDriver())

@@ -32,6 +32,26 @@ def test_round_trip_is_unknown_without_a_report():
     assert np.isnan(round_trip.seconds)
 
 
+@pytest.mark.parametrize("reported", [{-1}, {-1, 12}])
+def test_unreported_first_commands_increase_the_round_trip(reported):
+    """The messages report the same time stamps as before the first command."""
+    round_trip = RoundTrip()
+    round_trip.update(reported, -PERIOD)
+    for step in range(10):
+        round_trip.update({-1}, step * PERIOD)
+        round_trip.add_command(step * PERIOD, step * PERIOD)
+    assert round_trip.seconds == pytest.approx((10 - WINDOW) * PERIOD)
+
+
+def test_round_trip_is_unknown_when_another_program_commands():
+    round_trip = RoundTrip()
+    round_trip.update({-1}, -PERIOD)
+    for step in range(10):
+        round_trip.update({1_000_000 + step}, step * PERIOD)
+        round_trip.add_command(step * PERIOD, step * PERIOD)
+    assert np.isnan(round_trip.seconds)
+
+
 def test_lost_commands_are_no_latency():
     assert run(1, 40, lost={20, 21}).seconds == pytest.approx(PERIOD)
     assert run(1, 23, lost={20, 21}).seconds == pytest.approx(PERIOD)

@@ -631,7 +631,7 @@ def test_velocity_change_within_a_period_is_no_contradiction():
 # A second robot, a second program.
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.parametrize("number", [1, 3, 5])
 def test_velocity_is_restored_when_a_second_robot_is_detected(number):
     """The first statuses of a second robot, at rest in the same posture, are like those of a stopped arm."""
     rig = Rig().settle()
@@ -642,7 +642,7 @@ def test_velocity_is_restored_when_a_second_robot_is_detected(number):
         np.testing.assert_array_equal(rig.accepted, before)
         np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.03)
     assert rig.check(lambda status: replace(status, conflicts=1)) == Fault.CONFLICT
-    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.1)
+    np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.03)
     energy, speed = stop(rig, lambda status: replace(frozen_status, time=status.time, conflicts=rig.step, **rest))
     assert energy <= 0.5 * CRUISE @ M @ CRUISE * 1.05
     assert speed < 0.15
@@ -681,6 +681,30 @@ def test_collision_is_accepted_when_its_external_torque_is_reported():
         new.append(rig.estimate.is_new)
     assert not new[0]
     assert new[-1]
+
+
+def test_unexplained_statuses_are_used_again_with_another_fault():
+    """The other fault already stops the arm, and the prediction is too old after the maximum age."""
+    rig = Rig(external=np.zeros(2)).settle()
+    rig.v = rig.v + [0.5, 0.0]
+    rig.balance = DAMPING * rig.v
+    new = []
+    for count in range(1, 20):
+        assert rig.check(lambda true, count=count: replace(true, foreign_commands=count)) == Fault.SECOND_COMMANDER
+        new.append(rig.estimate.is_new)
+    held = new.index(True)
+    assert LIMITS.max_age < (held + 1) * PERIOD < LIMITS.max_age + 3 * PERIOD
+    assert all(new[held:])
+
+
+@pytest.mark.parametrize(("age", "speed"), [(0, 0.4), (2, 0.4), (3, np.nan)])
+def test_reported_speed_is_that_of_a_fresh_status(age, speed):
+    """It differs from the velocity estimate, which may be a prediction."""
+    rig = Rig().settle()
+    rig.state = replace(rig.state, velocity=np.zeros(2))
+    for _ in range(age):
+        rig.check(None)
+    assert rig.estimate.state.reported_speed(PERIOD) == pytest.approx(speed, nan_ok=True, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -859,7 +883,8 @@ def test_velocity_is_the_median_without_commanded_torque():
 
 
 def test_accepted_velocity_is_limited_to_the_other_sources():
-    for error, accepted_error, tolerance in ((0.05, 0.02, 1e-4), (0.019, 0.019, 1e-6)):  # [rad/s]
+    # Errors [rad/s]. A status with the last one is not used, because no torque explains it.
+    for error, accepted_error, tolerance in ((0.05, 0.02, 1e-4), (0.019, 0.019, 1e-6), (1.2, 0.0, 1e-6)):
         rig = Rig().settle()
         true = rig.v.copy()
         assert rig.check(shifted(velocities=[error, -error])) == Fault.NONE

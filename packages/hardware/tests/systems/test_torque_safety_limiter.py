@@ -1,3 +1,4 @@
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -322,6 +323,25 @@ def test_no_torque_is_sent_when_a_waiting_arm_is_stopped(plant):
         rig.advance(PERIOD)
         assert rig["is_sending"][0] == 0.0
         np.testing.assert_array_equal(rig["safe_torque"], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "rest", "is_refused"),
+    [(0.149, 0.0, False), (0.151, 0.0, True), (0.151, 0.15 - 2 * PERIOD, True), (0.151, 0.15 + 2 * PERIOD, False)],
+)
+def test_resume_is_refused_while_the_arm_moves(plant, speed, rest, is_refused):
+    """Statuses of another robot, which moves, are not followed."""
+    rig = Rig(plant)
+    rig.set(status_fault=[Fault.STALE])
+    rig.advance(LIMITS.damping_time + 1.0)
+    assert rig.arm_state == ArmState.OFF
+    moving = speed * np.eye(n)[2]
+    rig.set(status_fault=[0.0], velocity=moving, estimated_state=[*POSTURE, *moving])
+    rig.advance(2 * PERIOD)
+    rig.set(velocity=SPEED, estimated_state=[*POSTURE, *SPEED])
+    rig.advance(rest)
+    with pytest.raises(InputError, match="it moves") if is_refused else contextlib.nullcontext():
+        rig.system.resume(rig.context)
 
 
 def test_resume_is_refused_when_the_arm_is_not_stopped(plant):

@@ -194,13 +194,13 @@ class Template {
     for (int attempt = 0; attempt < kBacktracks; ++attempt) {
       const Transform X = project(state, between(last, request, fraction), true);
       const double ratio = speed_ratio(state, last, X, period);
-      if (ratio <= 1.0 && violation(state, X, true) <= kInside) return X;
-      fraction *= ratio > 1.0 ? 0.98 / ratio : 0.5;
+      if (ratio <= kMaxSpeedRatio && violation(state, X, true) <= kInside) return X;
+      fraction *= ratio > kMaxSpeedRatio ? 0.98 / ratio : 0.5;
     }
     if (violation(state, last) <= kInside) return last;
     const Transform X = project(state, last, true);
     const double ratio = speed_ratio(state, last, X, period);
-    return ratio <= 1.0 ? X : between(last, X, 1.0 / ratio);
+    return ratio <= kMaxSpeedRatio ? X : between(last, X, 1.0 / ratio);
   }
 
   // Largest violation of an active constraint [m or rad]; 0 inside.
@@ -261,7 +261,7 @@ class Template {
   }
 
  private:
-  static constexpr double kInside = 1e-9, kNearAxis = 1e-9, kClearance = 1e-8;
+  static constexpr double kMaxSpeedRatio = 1.0 + 1e-9, kInside = 1e-9, kNearAxis = 1e-9, kClearance = 1e-8;
   static constexpr int kBacktracks = 8;
   static constexpr double kTurn = 6.283185307179586;
 
@@ -340,7 +340,7 @@ class Template {
 
   bool can_enter(int state, const Transform& last, double period) const {
     const Transform X = project(state, last, false);
-    return speed_ratio(state, last, X, period) <= 1.0 && violation(state, X) <= kInside;
+    return speed_ratio(state, last, X, period) <= kMaxSpeedRatio && violation(state, X) <= kInside;
   }
 
   // Pose after the active constraints of a state in their order; constraints in the same frame form a group.
