@@ -631,7 +631,7 @@ def test_velocity_change_within_a_period_is_no_contradiction():
 # A second robot, a second program.
 
 
-@pytest.mark.parametrize("number", [1, 3, 5])
+@pytest.mark.parametrize("number", [1, 2, 3])
 def test_velocity_is_restored_when_a_second_robot_is_detected(number):
     """The first statuses of a second robot, at rest in the same posture, are like those of a stopped arm."""
     rig = Rig().settle()
@@ -684,17 +684,16 @@ def test_collision_is_accepted_when_its_external_torque_is_reported():
 
 
 def test_unexplained_statuses_are_used_again_with_another_fault():
-    """The other fault already stops the arm, and the prediction is too old after the maximum age."""
+    """The other fault already stops the arm. The prediction is too old, and the change of velocity decays."""
     rig = Rig(external=np.zeros(2)).settle()
     rig.v = rig.v + [0.5, 0.0]
     rig.balance = DAMPING * rig.v
     new = []
-    for count in range(1, 20):
+    for count in range(1, 80):
         assert rig.check(lambda true, count=count: replace(true, foreign_commands=count)) == Fault.SECOND_COMMANDER
         new.append(rig.estimate.is_new)
-    held = new.index(True)
-    assert LIMITS.max_age < (held + 1) * PERIOD < LIMITS.max_age + 3 * PERIOD
-    assert all(new[held:])
+    assert not any(new[: round(LIMITS.max_age / PERIOD)])
+    assert all(new[-10:])
 
 
 @pytest.mark.parametrize(("age", "speed"), [(0, 0.4), (2, 0.4), (3, np.nan)])
