@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-SHORTEN_PICTURES = "import run_pages; run_pages.shorten_pictures()"  # imports guiderail
+SHORTEN_PICTURES = "import run_page; run_page.shorten_pictures()"  # imports guiderail
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
 
 
@@ -27,7 +27,7 @@ def code_of(cell):
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs_in_a_new_interpreter(notebook, tmp_path):
     program = tmp_path / "cells.py"
-    shutil.copy(Path(__file__).with_name("run_pages.py"), tmp_path)  # the program imports it from its own folder
+    shutil.copy(Path(__file__).with_name("run_page.py"), tmp_path)  # the program imports it from its own folder
     first, *cells = filter(None, (code_of(cell) for cell in code_cells(notebook)))
     program.write_text("\n".join([first, SHORTEN_PICTURES, *cells]))
     # Not in a fork: modules that the tests have imported would hide a missing import.

@@ -1,6 +1,7 @@
 """Description of the differences between a configuration and the thesis."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -130,6 +131,13 @@ def all_options():
                         yield task, guidance, station, name, model.model_fields[field]
 
 
+@cache
+def default_and_its_differences(task, guidance, station):
+    """Return the default configuration of a guidance and a station, and its described differences."""
+    config = configure(task, {"guidance": guidance, "station": station})
+    return config, set(describe_differences(config, learns=False))
+
+
 def test_every_non_default_option_is_described_unless_neutral(monkeypatch):
     monkeypatch.setattr(BASE_POLICIES, "_entries", {})
     monkeypatch.setattr(BASE_POLICIES, "_origins", {})
@@ -139,14 +147,16 @@ def test_every_non_default_option_is_described_unless_neutral(monkeypatch):
         is_skipped = name in (*NEUTRAL, "station") or (name in HISTORY and guidance != "skgrl")
         if is_skipped or (task, guidance, name) in checked or (task, name) == ("Pouring", "reward"):
             continue
-        default = configure(task, {"guidance": guidance, "station": station})
+        default, before = default_and_its_differences(task, guidance, station)
         value = other_value(task, name, field, default.environment[name])
         if value is None:
             assert name in ("reward", "observation"), f"add a non-default value of {name} here"
             continue
-        options = {"guidance": guidance, "station": station} | FURTHER_OPTIONS.get(name, {})
-        configs = configure(task, options), configure(task, options | {name: value})
-        before, after = (set(describe_differences(config, learns=False)) for config in configs)
+        options = {"guidance": guidance, "station": station}
+        if further := FURTHER_OPTIONS.get(name):
+            options |= further
+            before = set(describe_differences(configure(task, options), learns=False))
+        after = set(describe_differences(configure(task, options | {name: value}), learns=False))
         assert before != after, f"{task}, {guidance}: {name}"
         checked.add((task, guidance, name))
     assert {name for task, _, name in checked if task == "BncConnector"} >= set(option_fields(Disturbances))

@@ -23,7 +23,8 @@ class Bead(gymnasium.Env):
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
         self.action_repeat, self.wall, self.render_mode = action_repeat, wall, render_mode
-        self.diagram = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1, symmetry=None)
+        self.diagram = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1)
+        self.diagram.symmetry = self.diagram.near_symmetry = None
         self.trace, self.length = EpisodeTrace(250, 2, 0.1, VIOLATIONS), 12
 
     def reset(self, *, seed=None, options=None):

@@ -22,7 +22,7 @@ def test_interval_of_equal_draws_is_narrow_and_of_different_draws_wide():
 def test_intervals_cover_rates_of_a_beta_distribution():
     rng = np.random.default_rng(0)
     inside = []
-    for _ in range(60):
+    for _ in range(20):
         mean, concentration = rng.uniform(0.2, 0.9), 10.0 ** rng.uniform(0.0, 1.5)
         rates = rng.beta(mean * concentration, (1.0 - mean) * concentration, size=31)
         values, probability = rate_distribution(rng.binomial(2, rates[:30]), np.full(30, 2))

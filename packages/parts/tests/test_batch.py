@@ -13,12 +13,15 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail_parts import batch, contact
 from guiderail_parts.batch import create_tasks, create_with_shrink
+from guiderail_parts.geometry import demonstrator
 from guiderail_parts.geometry.assembly_check import OverlapError
 from guiderail_parts.pairs import Pair, read_pairs
 from oracles.parts import PARTS
 
 
-def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys):
+def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])  # three demonstrations
+    monkeypatch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
     meshes, out = tmp_path / "meshes", tmp_path / "parts"
     for name in ("good", "bad"):
         (meshes / name).mkdir(parents=True)

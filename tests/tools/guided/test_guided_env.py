@@ -28,22 +28,6 @@ RECORDED = demonstrations()
 BOX = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def cached_fits():
-    """Fit equal demonstrations only once, because fits take most of the time of these tests."""
-    original, cache = guide.fit, {}
-
-    def fit(recorded, **options):
-        key = (*(array.tobytes() for array in (*recorded.times, *recorded.outputs)), repr(options))
-        if key not in cache:
-            cache[key] = original(recorded, **options)
-        return cache[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guide, "fit", fit)
-        yield
-
-
 def at_target(env, observation):
     """Return the origin of a segment's frame: the target of the environment."""
     return env.unwrapped.target

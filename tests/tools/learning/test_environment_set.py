@@ -18,11 +18,11 @@ from oracles.same_runs import differences
 
 SETTINGS = {"net_arch": "8", "gradient_steps": 1, "batch_size": 8, "learning_starts": 10}
 ENVIRONMENT = {"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40}
-VARIANTS = {"near": {}, "wide": {"gap_width": 0.1}, "slow": {"action_repeat": 20}}
+VARIANTS = {"near": {}, "walled": {"wall": 0.2}, "slow": {"action_repeat": 2}}
 
 
 def configuration(variants=VARIANTS, episodes=5, **settings):
-    members, _ = find_members(["NarrowPassage"], ENVIRONMENT, variants)
+    members, _ = find_members(["Bead"], {}, variants)
     first = members[0]
     return configure(
         first.task, first.environment, settings=SETTINGS | settings, episodes=episodes, seed=3, members=members
@@ -66,19 +66,18 @@ def test_environments_occur_equally_often_in_an_order_of_the_seed():
 
 def test_table_and_evaluation_name_the_environment_of_an_episode(tmp_path):
     run = guiderail.train(
-        "NarrowPassage", "kgrl", out=tmp_path / "run", variants=VARIANTS, episodes=6, seed=1, settings=SETTINGS,
-        action_dims="0,1", action_repeat=40, pictures=False,
-    )  # fmt: skip
+        "Bead", "skgrl", out=tmp_path / "run", variants=VARIANTS, episodes=6, seed=1, settings=SETTINGS, pictures=False
+    )
     assert collections.Counter(run.episodes["environment"]) == dict.fromkeys(VARIANTS, 2)
-    assert run.config.members[1].environment["gap_width"] == 0.1
-    assert run.config.action_repeat == 33  # mean of 40, 40 and 20
+    assert run.config.members[1].environment["wall"] == 0.2
+    assert run.config.action_repeat == 1  # mean of 1, 1 and 2, rounded
     evaluation = guiderail.evaluate(run, episodes=2, baselines=["uniform_random"], processes=1)
     assert evaluation["episodes"] == 6
     assert set(evaluation["environments"]) == set(VARIANTS)
     for name, rows in evaluation.rows.items():
         assert list(rows["environment"]) == [variant for variant in VARIANTS for _ in range(2)], name
     # An episode is that of the environment alone.
-    env = make_environment("NarrowPassage", run.config.members[1].environment)
+    env = make_environment("Bead", run.config.members[1].environment)
     env.reset(seed=1)
     alone = rollout(env, run.policy, index=0, seed=1_000_000, held_out=True)
     assert evaluation.rows["policy"]["return"][2] == alone["return"]
@@ -140,12 +139,12 @@ def test_sets_of_unequal_environments_are_refused(tmp_path):
 
 
 def test_resume_refuses_another_set(tmp_path):
-    options = {**ENVIRONMENT, "settings": SETTINGS, "pictures": False}
+    options = {"settings": SETTINGS, "pictures": False}
     out = tmp_path / "run"
-    train("NarrowPassage", out=out, variants=VARIANTS, episodes=1, **options)
-    train("NarrowPassage", out=out, variants=VARIANTS, episodes=2, resume=True, **options)
+    train("Bead", out=out, variants=VARIANTS, episodes=1, **options)
+    train("Bead", out=out, variants=VARIANTS, episodes=2, resume=True, **options)
     with pytest.raises(InputError, match="has another set of environments"):
-        train("NarrowPassage", out=out, variants={**VARIANTS, "more": {}}, episodes=3, resume=True, **options)
+        train("Bead", out=out, variants={**VARIANTS, "more": {}}, episodes=3, resume=True, **options)
     run = train(out=out, episodes=3, resume=True, pictures=False)
     assert sorted(run.episodes["environment"]) == sorted(VARIANTS)
 

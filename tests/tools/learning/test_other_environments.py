@@ -24,7 +24,8 @@ def guided(env, **more):
 @pytest.mark.parametrize("make", [lambda: guided(PointEnv()), lambda: TimeLimit(PointEnv(), 10), lambda: "Pendulum-v1"])
 def test_environment_of_another_package_is_trained(make, algorithm, tmp_path):
     env = make()
-    run = guiderail.train(env, out=tmp_path / "run", episodes=2, algorithm=algorithm)
+    settings = {"net_arch": "8"} if algorithm == "ppo" else {"net_arch": "8", "gradient_steps": 1}
+    run = guiderail.train(env, out=tmp_path / "run", episodes=2, algorithm=algorithm, settings=settings)
     assert len(run.episodes) == 2
     assert run.summary["curve"].startswith("none: ") or run.summary["curve"].endswith(".png")
     result = guiderail.evaluate(run, episodes=2, baselines=())
@@ -35,9 +36,11 @@ def test_environment_of_another_package_is_trained(make, algorithm, tmp_path):
 
 
 def test_resumed_run_is_the_same(tmp_path):
-    for episodes, resume in ((2, False), (4, True)):
-        run = guiderail.train(None if resume else "Pendulum-v1", out=tmp_path / "a", episodes=episodes, resume=resume)
-    other = guiderail.train("Pendulum-v1", out=tmp_path / "b", episodes=4)
+    given = {"settings": {"net_arch": "8", "gradient_steps": 1}, "pictures": False}
+    for episodes, resume in ((1, False), (2, True)):
+        task = None if resume else "Pendulum-v1"
+        run = guiderail.train(task, out=tmp_path / "a", episodes=episodes, resume=resume, **{} if resume else given)
+    other = guiderail.train("Pendulum-v1", out=tmp_path / "b", episodes=2, **given)
     assert run.episodes["return"].tolist() == other.episodes["return"].tolist()
 
 
