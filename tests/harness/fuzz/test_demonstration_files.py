@@ -178,18 +178,10 @@ FIELDS = st.sampled_from(
 )
 FIRST_LINES = st.sampled_from(
     [
-        "t,x",
-        "t,x,y",
-        "time [s],x",
-        "demonstration,time,x",
-        "demonstration,time,x,y",
-        "",
-        "x,y",
-        '"t","x"',
-        "t;x",
+        "t,x", "t,x,y", "time [s],x", "demonstration,time,x", "demonstration,time,x,y", "", "x,y", '"t","x"', "t;x",
         "T,x,",
     ]
-)
+)  # fmt: skip
 NUMBERS = st.sampled_from(["0", "1", "-2.5", "1e-3", " 7"])
 
 

@@ -97,13 +97,8 @@ def test_table_has_the_last_evaluation_of_each_seed(tmp_path):
     kgrl, residual = rows(task_table("BncConnector", tmp_path))
     assert kgrl[0] == "KGRL"
     assert residual[1:] == [
-        "60 (7, 8)",
-        "99 (98–100)",
-        "never (15–never)",
-        "6",
-        "0.40 mm, in 8 episodes",
-        "14.5 (31.0)",
-    ]
+        "60 (7, 8)", "99 (98–100)", "never (15–never)", "6", "0.40 mm, in 8 episodes", "14.5 (31.0)",
+    ]  # fmt: skip
     (row,) = rows(hard_tasks_table(tmp_path))
     effort = "60 (1); residual RL: 60 (2)"
     # Residual RL: 3 of 200 held-out episodes have violations (1.5 %), 7 of 120 training episodes were stopped (6 %).
