@@ -69,8 +69,7 @@ def certified(checker="yes", violations=0):
 def test_program_exits_with_1_when_a_certificate_fails(tmp_path, monkeypatch, capsys, result, sentence):
     (tmp_path / "skills.yaml").write_text("skills: {other: {task: NarrowPassage}, a_skill: {task: NarrowPassage}}\n")
     monkeypatch.setattr(
-        "research.certificates.certify_skill",
-        lambda *_, out, **__: result if out.name == "a_skill" else certified(),
+        "research.certificates.certify_skill", lambda *_, out, **__: result if out.name == "a_skill" else certified()
     )
     with pytest.raises(SystemExit) as ended:
         run_program(main, [str(tmp_path / "skills.yaml"), "--out", str(tmp_path / "out")])

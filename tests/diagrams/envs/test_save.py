@@ -9,10 +9,7 @@ from guiderail.models.common.errors import InputError
 
 CASES = [
     ("GridClamp", {"guidance": "sct", "station": "gantry", "action_repeat": 5}),
-    (
-        "GridClamp",
-        {"guidance": "sct", "station": "arm", "sensing": "robot", "difficulty": "hard", "action_repeat": 5},
-    ),
+    ("GridClamp", {"guidance": "sct", "station": "arm", "sensing": "robot", "difficulty": "hard", "action_repeat": 5}),
     (
         "BncConnector",
         {
