@@ -15,9 +15,6 @@ class WideGap(gr.Task):
         path = gr.ReferenceTrajectory.straight([0.35, 0.1], [0.35, 0.9], std=0.04, num_steps=80, period=0.02)
         return gr.Prior(path, gr.LinearConstraints([[1.0, 0.0], [-1.0, 0.0]], [0.25, -0.45]))
 
-    def rewards(self):
-        return {"nearness": lambda pose: -self.workcell().goal_distance(pose)}
-
     def done(self):
         return {"success": self.workcell().at_goal}
 

@@ -8,22 +8,17 @@ and the same command resumes. `rows/` has the episodes, `engines.csv` one row pe
 
 from __future__ import annotations
 
-import sys
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.train import train
 from guiderail.tools.tables import read_table, table_text
 from research.command import Parser, print_result, run_program
 from research.results.methods import markdown_table
+from research.stored import continue_run, evaluate_stored
 
 TASK = "BncConnector"
 ENVIRONMENT: dict[str, Any] = {"guidance": "kgrl", "difficulty": "hard", "reward": "aligned", "sensing": "wrist"}
@@ -62,12 +57,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 def train_once(method: str, seed: int, episodes: int, out: Path) -> Path:
     """Train a method with a seed, or continue its run; return the folder of the run."""
     run, change = out / "runs" / f"{method}-{seed}", ABLATIONS[method]
-    if (run / "policy.safetensors").exists():
-        return run
-    _report(f"training {run.name}")
-    if (run / "config.yaml").exists():
-        train(out=run, episodes=episodes, resume=True, pictures=False)
-    else:
+    if not continue_run(run, episodes):
         train(
             TASK,
             out=run,
@@ -85,16 +75,8 @@ def train_once(method: str, seed: int, episodes: int, out: Path) -> Path:
 def evaluate_once(source: Path | str, method: str, condition: str, file: Path) -> None:
     """Evaluate the policy of a run, or a baseline policy, under a condition, unless its episodes are stored."""
     change, episodes = CONDITIONS[condition]
-    if file.exists() and len(read_table(file)) >= episodes:
-        return
     options = {**ENVIRONMENT, "station": "arm", **ABLATIONS.get(method, {}).get("environment", {}), **change}
-    with closing(make_environment(TASK, options)) as env:
-        env.reset(seed=0)
-        act = Policy.load(source) if isinstance(source, Path) else make_baseline(TASK, source)(env)
-        rows = evaluate_policy(env, act, episodes=episodes)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, table_text(rows).encode())
-    _report(f"{file.parent.name}, {condition}: {int(rows['success'].sum())} of {len(rows)}")
+    evaluate_stored(TASK, options, {file: source}, episodes)
 
 
 def tabulate(out: Path) -> pd.DataFrame:
@@ -129,10 +111,6 @@ def condition_table(table: pd.DataFrame) -> str:
             [str(condition), str(rows["episodes"].max()), *(", ".join(map(str, cell)) or "–" for cell in cells)]
         )
     return markdown_table(lines[0], lines[1:])
-
-
-def _report(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def main(arguments: list[str]) -> None:

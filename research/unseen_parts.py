@@ -11,27 +11,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment, task_named
-from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.environments import task_named
 from guiderail.tools.export import write_ensemble
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import Choices
-from guiderail.tools.learning.train import Training, train
-from guiderail.tools.tables import read_table, table_text, write_table
+from guiderail.tools.learning.train import Training
+from guiderail.tools.tables import read_table, write_table
 from guiderail_parts.batch import create_tasks
 from guiderail_parts.pairs import Pair, find_pairs
 from research.command import Parser, print_result, run_program
+from research.stored import continue_run, evaluate_stored, report
 
 TRAINING, HELD_OUT = 60, 30  # numbers of parts
 HELD_OUT_FRACTION = 0.34  # fraction of all pairs from which the held-out parts are taken
@@ -58,7 +54,7 @@ def prepare(pairs: Mapping[str, Pair], names: Sequence[str], number: int, out: P
         if len(folders) >= number:
             break
         chunk = [pairs[name] for name in names[start : start + processes]]
-        results = create_tasks(chunk, out, processes=processes, log=_report)
+        results = create_tasks(chunk, out, processes=processes, log=report)
         folders += [out / name for name, result in results.items() if "error" not in result]
     return folders[:number]
 
@@ -70,13 +66,8 @@ def prepared(folder: Path, names: Sequence[str], number: int) -> list[Path]:
 
 def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Path:
     """Train a policy over parts, or continue the run; return its folder."""
-    if (run / "policy.safetensors").exists():
-        return run
-    _report(f"training {run.name} on {len(parts)} parts")
     names = [task_named(str(part)) for part in parts]
-    if (run / "config.yaml").exists():
-        train(out=run, episodes=episodes, resume=True, pictures=False)
-    else:
+    if not continue_run(run, episodes):
         imports = [folder for _, folders in names for folder in folders]
         choices = Choices(settings=SETTINGS, episodes=episodes, seed=seed, step_log=False)
         Training(run, [name for name, _ in names], ENVIRONMENT, choices, imports=imports, pictures=False).start()
@@ -84,24 +75,9 @@ def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Pa
 
 
 def evaluate_part(part: Path, policies: Mapping[str, Path | str], episodes: int, out: Path) -> None:
-    """Evaluate policies on the same held-out episodes of a part; stored episodes are not simulated again.
-
-    A policy is the folder of a run, or the name of a baseline policy.
-    """
-    files = {name: out / "rows" / name / f"{part.name}.csv" for name in policies}
-    missing = [name for name, file in files.items() if not file.exists() or len(read_table(file)) < episodes]
-    if not missing:
-        return
-    task, _ = task_named(str(part))
-    with closing(make_environment(task, ENVIRONMENT)) as env:
-        env.reset(seed=0)
-        for name in missing:
-            source = policies[name]
-            act = Policy.load(source) if isinstance(source, Path) else make_baseline(task, source)(env)
-            rows = evaluate_policy(env, act, episodes=episodes)
-            files[name].parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(files[name], table_text(rows).encode())
-            _report(f"{part.name} {name}: {int(rows['success'].sum())} of {len(rows)}")
+    """Evaluate policies, folders of runs or names of baseline policies, on the same held-out episodes of a part."""
+    sources = {out / "rows" / name / f"{part.name}.csv": source for name, source in policies.items()}
+    evaluate_stored(task_named(str(part))[0], ENVIRONMENT, sources, episodes)
 
 
 def tabulate(out: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -127,10 +103,6 @@ def tabulate(out: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
             "mean_where_learning_shows": round(float(column[table["shows_learning"]].mean()), 4), **worst[name],
         }  # fmt: skip
     return table, summary
-
-
-def _report(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def main(arguments: list[str]) -> None:
@@ -167,16 +139,13 @@ def main(arguments: list[str]) -> None:
     if file.exists() and json.loads(file.read_text(encoding="utf-8")) != split:
         raise InputError(f"{file} has the split of other meshes: name another folder with --out")
     write_atomically(file, json.dumps(split, indent=1).encode())
-    if args.prepared is None:
-        held_out, training = (
-            prepare(pairs, names, number, out / "tasks", args.processes)
-            for names, number in ((held_out_names, args.held_out), (training_names, args.training))
-        )
-    else:
-        held_out, training = (
-            prepared(args.prepared.resolve(), names, number)
-            for names, number in ((held_out_names, args.held_out), (training_names, args.training))
-        )
+    tasks = out / "tasks" if args.prepared is None else args.prepared.resolve()
+    held_out, training = (
+        prepare(pairs, names, number, tasks, args.processes)
+        if args.prepared is None
+        else prepared(tasks, names, number)
+        for names, number in ((held_out_names, args.held_out), (training_names, args.training))
+    )
     used = {"training": [part.name for part in training], "held_out": [part.name for part in held_out]}
     write_atomically(out / "parts.json", json.dumps(used, indent=1).encode())
     runs = [train_once(training, out / "runs" / f"general-{seed}", seed, args.episodes) for seed in range(args.seeds)]

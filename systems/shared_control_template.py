@@ -88,6 +88,11 @@ class TemplateFrames:
         return {name: pose_to_transform(pose) for name, pose in zip(self.names, poses, strict=True)}
 
 
+_frame_poses_getter = input_getter(
+    "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
+)
+
+
 def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:
     pose = transform_to_pose(X_WF)
     if not np.isfinite(pose).all():
@@ -127,8 +132,8 @@ class SctStateMachine(LeafSystem):
             state limits force or torque and nothing reads ``max_wrench``.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
-            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
+        frames: Poses of the template's object frames, which a reset can set, or the port ``frame_poses``
+            (`TemplateFrames`).
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
@@ -155,9 +160,7 @@ class SctStateMachine(LeafSystem):
 
     get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
     get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
-    get_frame_poses_input_port = input_getter(
-        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
-    )
+    get_frame_poses_input_port = _frame_poses_getter
     get_state_output_port = output_getter("state", "number of the template's state, (1,)")
     get_transition_distance_output_port = output_getter("transition_distance", "transition distance, (1,) [m or rad]")
     get_progress_output_port = output_getter("progress", "progress in the task, (1,)")
@@ -210,8 +213,8 @@ class SctInputMapping(LeafSystem):
         InputError: If the period is not positive, or a frame is missing or not finite.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
-            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
+        frames: Poses of the template's object frames, which a reset can set, or the port ``frame_poses``
+            (`TemplateFrames`).
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
@@ -228,9 +231,7 @@ class SctInputMapping(LeafSystem):
     get_action_input_port = input_getter("action", "inputs u of a policy or a user, (n,), in [−1, 1]")
     get_pose_input_port = input_getter("pose", "pose H to displace, (6,)")
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
-    get_frame_poses_input_port = input_getter(
-        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
-    )
+    get_frame_poses_input_port = _frame_poses_getter
     get_requested_pose_output_port = output_getter("requested_pose", "requested pose H^im, (6,), not constrained")
 
     def _requested_pose(self, context: Context) -> np.ndarray:
@@ -271,8 +272,8 @@ class ActiveConstraintProjector(LeafSystem):
             rad outside of the active constraints.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
-            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
+        frames: Poses of the template's object frames, which a reset can set, or the port ``frame_poses``
+            (`TemplateFrames`).
     """
 
     def __init__(
@@ -311,9 +312,7 @@ class ActiveConstraintProjector(LeafSystem):
     get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
-    get_frame_poses_input_port = input_getter(
-        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
-    )
+    get_frame_poses_input_port = _frame_poses_getter
     get_desired_pose_output_port = output_getter("desired_pose", "command H^ac, (6,), inside the active constraints")
     get_last_desired_pose_output_port = output_getter("last_desired_pose", "previous command, (6,)")
     get_fallback_output_port = output_getter("fallback", "flag that the last safe command is repeated, (1,)")

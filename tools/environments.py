@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
     TASKS,
     check_task_name,
+    content_digest,
     environment_id,
     is_task_folder,
     register_task_folder,
@@ -58,7 +59,7 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     Relative paths are skipped; `import_modules` returns absolute ones.
     """
     declared = TASKS.get(task) if task in TASKS.names() else None
-    folder, folder_digest = (None, "") if declared is None else (declared.folder, declared.folder_digest())
+    folder, folder_digest = (None, "") if declared is None else (declared.folder, content_digest(declared))
     texts = [value for _, value in sorted(environment.items()) if isinstance(value, str)]
     sources = [*imports, *(re.sub(r"\.py:\w+$", ".py", text) for text in texts)]
     paths = [path for path in map(Path, sources) if path.is_absolute() and folder not in (path, *path.parents)]

@@ -163,7 +163,7 @@ def on_clock(reference: ReferenceTrajectory, period: float) -> ReferenceTrajecto
 
 def stations_of(task: type[Task]) -> list[str]:
     """Return the names of the stations that a task supports."""
-    return [name for name in stations_for(station_kind_of(task).workcell_kind) if task.supports(name)]
+    return [name for name in stations_for(station_kind_of(task).workcell_kind) if name not in task.unsupported_stations]
 
 
 def station_kind_of(task: type[Task]) -> StationKind:
@@ -226,7 +226,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
 
 def _check_station(task: type[Task], name: Any) -> None:
     """Raise an InputError unless the task supports a station; only this station is imported if it does."""
-    is_known = isinstance(name, str) and name in STATIONS.names() and task.supports(name)
+    is_known = isinstance(name, str) and name in STATIONS.names() and name not in task.unsupported_stations
     if not is_known or STATIONS.get(name).workcell_kind != station_kind_of(task).workcell_kind:
         check_choice("station", name, stations_of(task), task.name)
 

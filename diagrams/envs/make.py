@@ -35,6 +35,7 @@ from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
+from guiderail.diagrams.tasks.registry import content_digest
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS
@@ -290,7 +291,7 @@ def _key(config: EnvConfig, render_mode: str | None) -> Hashable:
     try:
         declared = config.guidance_kind.options
         key = None if declared is None else declared.diagram_key(options)
-        files = task.folder_digest(), *map(_digest, options.values())
+        files = content_digest(task), *map(_digest, options.values())
         return task, config.guidance_kind, config.station_kind, key, render_mode, freeze(options), files
     except (TypeError, OSError, InputError):
         return None  # an option is not comparable, or a file that an option names or of the task folder cannot be read

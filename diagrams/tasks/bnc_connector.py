@@ -15,16 +15,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import Observed
-from guiderail.diagrams.envs.options import STANDARD, Integer, Number
-from guiderail.diagrams.envs.scene import (
-    ARM_VIEW,
-    TOOL_VIEW,
-    Scene,
-    box_edges,
-    front_camera,
-    in_frame,
-    viewpoint,
-)
+from guiderail.diagrams.envs.options import Integer, Number
+from guiderail.diagrams.envs.scene import ARM_VIEW, TOOL_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
@@ -32,20 +24,21 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
-    COLLISION_FORCE,
     COMMAND_SCALE,
-    FORCE_LIMITS,
     HISTORY_VARIANCE,
     NEGLIGIBLE_OFFSET,
     REPEATABILITY_STD,
-    FixtureOffsetOptions,
     HiddenOffsets,
-    PriorOptions,
+    PriorStd,
+    force_limit_field,
+    friction_field,
     in_ring,
+    length_field,
+    prior_std_field,
     reference_of_file,
 )
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
+from guiderail.diagrams.tasks.task import Condition
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
@@ -307,7 +300,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 
 
 @register_task("BncConnector")
-class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
+class BncConnector(DemonstratedInsertion):
     """Insert, align and lock the connector.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28); "shaped" and "aligned" add terms to it.
@@ -316,6 +309,8 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
     workpiece, fixture = "plug", "jack"
     simulated_rewards = ("aligned",)
     presets = {"hard": HARD}
+    scripted_policies = (scripted_torque_search, scripted_center_of_pressure)
+    scripted_defaults = {"hard": scripted_center_of_pressure}
     defaults = {"guidance": "skgrl", "action_repeat": 10, "action_dims": (0, 1), "history.variance": HISTORY_VARIANCE}
 
     reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
@@ -323,29 +318,24 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
         "state", description="name of the observation"
     )
 
-    start_offset_max: Number = Field(
-        0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"
+    start_offset_max: Number = length_field(0.0, 0.0, ALIGNMENT, "largest sampled offset of the start along x and y")
+    bound: Number = length_field(ALIGNMENT, 0.5 * MM, 6.0 * MM, "bound of a command's |x| and |y|")
+    force_limit: Number = force_limit_field(5)
+    mouth_chamfer: Number = length_field(
+        NOMINAL.mouth_chamfer, 0.05 * MM, 0.6 * MM, "chamfer of the plug's mouth and slots"
     )
-    bound: Number = Field(ALIGNMENT, ge=0.5 * MM, le=6.0 * MM, description="bound of a command's |x| and |y| [m]")
-    force_limit: Number = Field(
-        COLLISION_FORCE, ge=5, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
+    bore_clearance: Number = length_field(
+        NOMINAL.bore_clearance, 0.05 * MM, 0.2 * MM, "clearance between barrel and bore on each side"
     )
-    mouth_chamfer: Number = Field(
-        NOMINAL.mouth_chamfer, ge=0.05 * MM, le=0.6 * MM, description="chamfer of the plug's mouth and slots [m]"
-    )
-    bore_clearance: Number = Field(
-        NOMINAL.bore_clearance,
-        ge=0.05 * MM,
-        le=0.2 * MM,
-        description="clearance between barrel and bore on each side [m]",
-    )
-    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
+    friction: Number = friction_field(FRICTION, "the connector's metal")
     demonstrations: str = Field(
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )
     num_demonstrations: Integer | None = Field(
         None, ge=1, description="number of demonstrations to use, from the first on; a single one needs prior_std"
     )
+
+    prior_std: PriorStd | None = prior_std_field()
 
     @field_validator("demonstrations")
     @classmethod
@@ -420,12 +410,6 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
         half = Symmetry.of_signs(observation, HALF_TURN, (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH))
         more = len(self.force_limit_terms())
         return half.pad(more), Symmetry(*sides_of_the_rim(self.observation)).pad(more)
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
-        return {policy.__name__: policy for policy in (default, scripted_torque_search, scripted_center_of_pressure)}
 
     def scene(self) -> Scene:
         """Return the demonstrations, the box of the alignment constraint and a camera that looks down at the jack."""

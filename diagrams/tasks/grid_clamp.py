@@ -13,16 +13,16 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed
-from guiderail.diagrams.envs.options import STANDARD, Number, Pair, increases
+from guiderail.diagrams.envs.options import Number, Pair, increases
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import PRIVILEGED, InsertionTask
-from guiderail.diagrams.tasks.options import FORCE_LIMITS, HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.options import HiddenOffsets, force_limit_field, friction_field, in_ring, length_field
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy, terminal_reward
+from guiderail.diagrams.tasks.task import Condition, terminal_reward
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp import (
@@ -37,9 +37,6 @@ from guiderail.models.objects.grid_clamp import (
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.templates import load_template
 
-# Contact force above which an episode ends [N]. An unbounded impedance of 1500 N/m does not reach this force: the
-# template's cuboid is 8 mm wide, and ends 6 mm below the target and 18 mm below a clamp on the table.
-COLLISION_FORCE = 35.0
 START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
 NOMINAL = GridClampDimensions()
@@ -265,6 +262,8 @@ class GridClamp(InsertionTask):
     simulated_rewards = ("aligned",)
     snaps_in = True
     presets = {"hard": HARD}
+    scripted_policies = (scripted_search, scripted_gentle_search, straight_descent)
+    scripted_defaults = {"hard": scripted_gentle_search}
     defaults = {"guidance": "sct", "action_repeat": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 
@@ -273,21 +272,14 @@ class GridClamp(InsertionTask):
         "per_run", description="offsets of table and clamp: sampled per run or per episode; none: clamp within 0.15 mm"
     )
     start_height: StartHeight = Field(START_HEIGHT, description="smallest and largest start height [m]")
-    force_limit: Number = Field(
-        COLLISION_FORCE, ge=8, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
-    )
+    force_limit: Number = force_limit_field(8)
     seconds: Number = Field(10.0, ge=2, le=30, description="duration of an episode [s]")
-    hole_chamfer: Number = Field(NOMINAL.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the holes [m]")
-    peg_chamfer: Number = Field(
-        NOMINAL.peg_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the pegs' tips [m]"
+    hole_chamfer: Number = length_field(NOMINAL.hole_chamfer, 0.1 * MM, 0.8 * MM, "chamfer of the holes")
+    peg_chamfer: Number = length_field(NOMINAL.peg_chamfer, 0.1 * MM, 0.8 * MM, "chamfer of the pegs' tips")
+    clearance: Number = length_field(
+        NOMINAL.clearance, 0.05 * MM, 0.15 * MM, "clearance between a peg and its hole on each side"
     )
-    clearance: Number = Field(
-        NOMINAL.clearance,
-        ge=0.05 * MM,
-        le=0.15 * MM,
-        description="clearance between a peg and its hole on each side [m]",
-    )
-    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of pegs, holes and table")
+    friction: Number = friction_field(FRICTION, "pegs, holes and table")
 
     @property
     def offsets(self) -> GridClampUncertainty:
@@ -358,13 +350,6 @@ class GridClamp(InsertionTask):
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        default = scripted_gentle_search if difficulty == "hard" else scripted_search
-        policies = (default, scripted_search, scripted_gentle_search, straight_descent)
-        return {policy.__name__: policy for policy in policies}
 
     def scene(self) -> Scene:
         """Return the cuboid that bounds commands, up to 25 mm above the target, and a camera at the holes."""

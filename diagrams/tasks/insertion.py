@@ -10,10 +10,10 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from scipy.linalg import block_diag
@@ -29,9 +29,13 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     CONTACT_MEMORY,
+    FORCE_LIMITS,
     MIN_CONTACT_FORCE,
-    ForceOptions,
+    NEGLIGIBLE_OFFSET,
+    ForceRange,
     HiddenOffsets,
+    OffsetRange,
+    force_limit_field,
     in_ring,
 )
 from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, terminal_reward
@@ -88,7 +92,7 @@ class HoldTest:
 HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 
 
-class InsertionTask(ForceOptions, Task):
+class InsertionTask(Task):
     """Insertion of a workpiece in the tool into a fixture, with sampled offsets of both and a force limit.
 
     Held-out offsets are sampled from the same range as training offsets, with random numbers that training never uses.
@@ -108,6 +112,22 @@ class InsertionTask(ForceOptions, Task):
     fixture: ClassVar[str]
     simulated_rewards: ClassVar[tuple[str, ...]] = ()
     snaps_in: ClassVar[bool] = False
+
+    force_limit: Number = force_limit_field(FORCE_LIMITS[0])
+    force_limit_range: ForceRange | None = Field(
+        None,
+        description="range from which the force limit of every episode is sampled [N]; the policy observes the limit, "
+        "except with observation=image; default: force_limit",
+    )
+    bounded_force: bool = Field(
+        True,
+        description="limit the force of the impedance so that it stays below force_limit; if false: to 40 N per axis",
+    )
+
+    @property
+    def largest_force_limit(self) -> float:
+        """Largest force limit of an episode [N]."""
+        return self.force_limit if self.force_limit_range is None else self.force_limit_range[1]
 
     @property
     @abstractmethod
@@ -321,6 +341,22 @@ class DemonstratedInsertion(InsertionTask):
     """
 
     start_offset_max: Number
+    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
+        "per_run",
+        description="offset of the fixture: sampled per run or per episode; none: at most 0.3 mm, sampled per episode",
+    )
+    offset_range: OffsetRange | None = Field(
+        None, description="smallest and largest offset of the fixture [m]; default: depends on fixture_offset"
+    )
+
+    @field_validator("offset_range")
+    @classmethod
+    def _check_offset_range(cls, value: OffsetRange | None, info: ValidationInfo) -> OffsetRange | None:
+        if value is not None and value[1] > NEGLIGIBLE_OFFSET and info.data.get("fixture_offset") == "none":
+            raise ValueError(
+                f"fixture_offset=none allows offsets up to {NEGLIGIBLE_OFFSET:g} m: choose fixture_offset=per_episode"
+            )
+        return value
 
     @property
     @abstractmethod

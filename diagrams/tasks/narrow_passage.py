@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed
-from guiderail.diagrams.envs.options import STANDARD, Number, Pair, ResetOptions
+from guiderail.diagrams.envs.options import Number, Pair, ResetOptions
 from guiderail.diagrams.envs.scene import Camera, Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import Prior
@@ -23,7 +23,6 @@ from guiderail.diagrams.tasks.options import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import (
     Condition,
-    ScriptedPolicy,
     Task,
     Threshold,
     World,
@@ -121,6 +120,7 @@ class NarrowPassage(Task):
     has_held_out_distribution = True
     defaults = {"guidance": "skgrl", "action_repeat": 5}
     presets = {"hard": HARD}
+    scripted_policies = (scripted_slalom,)
     clip = 1.0
     statistics = (
         Metric(
@@ -306,11 +306,6 @@ class NarrowPassage(Task):
 
     def _start_deviation(self, held_out: bool) -> float:
         return self.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policy by its name."""
-        return {"scripted_slalom": scripted_slalom}
 
     def scene(self) -> Scene:
         """Return the demonstrations, the edge of the restricted zone, and a camera above the plane."""

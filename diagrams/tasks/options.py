@@ -1,23 +1,25 @@
-"""Options that several tasks have, hidden offsets and references fitted to files; nothing here imports Drake."""
+"""Fields of options that tasks share, hidden offsets and references fitted to files; nothing here imports Drake."""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number, Numbers, Pair, TaskOptions, increases, satisfies
+from guiderail.diagrams.envs.options import Numbers, Pair, increases, satisfies
 from guiderail.diagrams.stations.options import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 from guiderail.models.primitives.reference import interpolate_prior
 
-COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
+# Default force limit [N]. In GridClamp, an unbounded impedance of 1500 N/m does not reach it: the template's cuboid is
+# 8 mm wide, and ends 6 mm below the target and 18 mm below a clamp on the table.
+COLLISION_FORCE = 35.0
 MIN_CONTACT_FORCE = 0.5  # smallest force along z at which a center of pressure is computed [N]
 CONTACT_MEMORY = 1.0  # time over which points of contact are averaged [s]
 
@@ -58,61 +60,30 @@ ForceRange = Annotated[
 ]
 
 
-class FixtureOffsetOptions(TaskOptions):
-    """Options of a task whose fixture is offset from its nominal position."""
-
-    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run",
-        description="offset of the fixture: sampled per run or per episode; none: at most 0.3 mm, sampled per episode",
-    )
-    offset_range: OffsetRange | None = Field(
-        None, description="smallest and largest offset of the fixture [m]; default: depends on fixture_offset"
-    )
-
-    @field_validator("offset_range")
-    @classmethod
-    def _check_offset_range(cls, value: OffsetRange | None, info: ValidationInfo) -> OffsetRange | None:
-        if value is not None and value[1] > NEGLIGIBLE_OFFSET and info.data.get("fixture_offset") == "none":
-            raise ValueError(
-                f"fixture_offset=none allows offsets up to {NEGLIGIBLE_OFFSET:g} m: choose fixture_offset=per_episode"
-            )
-        return value
+def force_limit_field(least: float) -> Any:
+    """Return the field of a force limit of at least `least` [N]."""
+    description = "force that ends an episode as a collision [N]"
+    return Field(COLLISION_FORCE, ge=least, le=FORCE_LIMITS[1], description=description)
 
 
-class PriorOptions(TaskOptions):
-    """Options of a task with recorded demonstrations of poses: several, or only one."""
+def friction_field(default: float, surfaces: str) -> Any:
+    """Return the field of a friction coefficient; `surfaces` names what has it."""
+    return Field(default, ge=0.05, le=0.4, description=f"friction coefficient of {surfaces}")
 
-    prior_std: PriorStd | None = Field(
+
+def length_field(default: float, least: float, largest: float, description: str) -> Any:
+    """Return the field of a length [m] from `least` to `largest`."""
+    return Field(default, ge=least, le=largest, description=f"{description} [m]")
+
+
+def prior_std_field() -> Any:
+    """Return the field of the standard deviation around a single demonstration, a `PriorStd` or None."""
+    return Field(
         None,
         description="standard deviation around a single demonstration, required for one demonstration: x y z Rz Ry Rx "
         "[m], [rad], or rows of a phase from 0 to 1 and six such numbers; its square is added to the fitted variance",
         examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
     )
-
-
-class ForceOptions(TaskOptions):
-    """Options of a task with a force limit."""
-
-    force_limit: Number = Field(
-        COLLISION_FORCE,
-        ge=FORCE_LIMITS[0],
-        le=FORCE_LIMITS[1],
-        description="force that ends an episode as a collision [N]",
-    )
-    force_limit_range: ForceRange | None = Field(
-        None,
-        description="range from which the force limit of every episode is sampled [N]; the policy observes the limit, "
-        "except with observation=image; default: force_limit",
-    )
-    bounded_force: bool = Field(
-        True,
-        description="limit the force of the impedance so that it stays below force_limit; if false: to 40 N per axis",
-    )
-
-    @property
-    def largest_force_limit(self) -> float:
-        """Largest force limit of an episode [N]."""
-        return self.force_limit if self.force_limit_range is None else self.force_limit_range[1]
 
 
 def reference_of_file(

@@ -15,7 +15,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.options import STANDARD, Integer, Number, Numbers, Pair, ResetOptions
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Pair, ResetOptions
 from guiderail.diagrams.envs.scene import Camera, Scene, in_frame, look_at, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior
@@ -25,7 +25,6 @@ from guiderail.diagrams.tasks.options import episode_stream, in_ring
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import (
     Condition,
-    ScriptedPolicy,
     Task,
     Threshold,
     World,
@@ -290,6 +289,8 @@ class Pouring(Task):
     has_held_out_distribution = True
     defaults = {"guidance": "sct", "action_repeat": 10}
     presets = {"hard": HARD, "thesis": THESIS}
+    scripted_policies = (scripted_pour, scripted_pour_from_above, scripted_pour_aimed, scripted_pour_blind)
+    scripted_defaults = {"hard": scripted_pour_aimed, "thesis": scripted_pour_from_above}
     learner = {"algorithm": "sac", "preset": "pouring"}
     clip = 10.0
 
@@ -517,14 +518,6 @@ class Pouring(Task):
         if self.aim:
             world.set("mug_error", error)
         return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        defaults = {"hard": scripted_pour_aimed, "thesis": scripted_pour_from_above}
-        default = defaults.get(difficulty, scripted_pour)
-        policies = (default, scripted_pour, scripted_pour_from_above, scripted_pour_aimed, scripted_pour_blind)
-        return {policy.__name__: policy for policy in policies}
 
     def scene(self) -> Scene:
         """Return the frame, viewpoint and line width in which the tip's paths are drawn, and a camera at the mug."""

@@ -5,7 +5,6 @@ This module is imported by `import guiderail`, so it imports neither Drake nor p
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -68,11 +67,6 @@ def _check(name: str, task: type[Task]) -> None:
     from guiderail.diagrams.tasks.task import Task
 
     check_class(name, task, Task)
-    if not isinstance(inspect.getattr_static(task, "scripted_policies"), classmethod | staticmethod):
-        raise InputError(
-            f"scripted_policies of {name} is called without an instance: make it a @classmethod with the arguments "
-            "(cls, difficulty)"
-        )
 
 
 def is_task_folder(name: str | Path) -> bool:
@@ -92,12 +86,12 @@ def register_task_folder(folder: str | Path) -> str:
         InputError: If the folder's task is not valid, another task has its name, or guiderail-parts, which reads
             task folders, is not installed.
     """
-    task: type[Task] = load_plugin("task_folder", "part", sibling="parts")(Path(folder))
+    task = _read_task_folder(Path(folder))
     name = task.name
     registered = TASKS.get(name) if name in TASKS.names() else task
     existing_folder = registered.folder
     if existing_folder is not None and existing_folder != task.folder:
-        if is_task_folder(existing_folder) and registered.folder_digest() == task.folder_digest():
+        if is_task_folder(existing_folder) and content_digest(registered) == task.digest:
             return register_task_folder(existing_folder)
         raise InputError(
             f"the tasks in {task.folder} and {existing_folder} are both called {name}: change 'name:' in the "
@@ -105,6 +99,15 @@ def register_task_folder(folder: str | Path) -> str:
         )
     register_task(name)(task)
     return task.name
+
+
+def _read_task_folder(folder: Path) -> type[Task]:
+    return load_plugin("task_folder", "part", sibling="parts")(folder)
+
+
+def content_digest(task: type[Task]) -> str:
+    """Return a digest of the files of a task's folder as they are now; "" if the task has no folder."""
+    return "" if task.folder is None else _read_task_folder(task.folder).digest
 
 
 def environment_id(name: str) -> str:

@@ -24,7 +24,7 @@ from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.station import Impedance, Station
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.termination import TERMINATIONS
+from guiderail.models.common.termination import TERMINATIONS, Termination
 
 ScriptedPolicy = Callable[[np.ndarray], np.ndarray]
 """Function from an observation to an action."""
@@ -144,13 +144,18 @@ class Task(option_models.TaskOptions):
     Attributes:
         name: Name, set by `register_task`.
         folder: Folder of a task that is read from files; None for any other task.
+        digest: Digest of the files of `folder` when they were read; "" without a folder.
         station: Class or function of the default station, which is registered by `register_station`. Stations for the
-            same kind of workcell can be chosen instead.
+            same kind of workcell can be chosen instead, except `unsupported_stations`.
+        unsupported_stations: Names of stations for this kind of workcell that the task cannot use.
         Reset: Class of the options of a reset, a subclass of `guiderail.ResetOptions`.
         defaults: Default values of environment options by name, such as the guidance; they replace the usual defaults.
         presets: Options by name for each difficulty other than "standard". These options override `defaults`, and given
             options override both.
         learner: Default algorithm and preset of `guiderail train`.
+        scripted_policies: Functions from the observation, (n,), as `observe` declares it, to an action, (A,), in
+            [−1, 1]. `guiderail evaluate` runs the first one as a baseline, unless the observation is an image.
+        scripted_defaults: Scripted policy that a difficulty has as the baseline instead of the first one.
         clip: Largest absolute value in an observation.
         statistics: Statistics of a table of episodes that only this task has; a study may name them.
         has_held_out_distribution: True if `reset` can sample from a held-out distribution. Otherwise an evaluation
@@ -161,11 +166,15 @@ class Task(option_models.TaskOptions):
     model_config = ConfigDict(ignored_types=(bool, int, float, str, tuple, list, dict, NoneType, Threshold))
     name: ClassVar[str] = ""
     folder: ClassVar[Path | None] = None
+    digest: ClassVar[str] = ""
     station: ClassVar[Callable[..., Station]]
+    unsupported_stations: ClassVar[tuple[str, ...]] = ()
     Reset: ClassVar[type[option_models.ResetOptions]] = option_models.ResetOptions
     defaults: ClassVar[Mapping[str, Any]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "tqc_contact"}
+    scripted_policies: ClassVar[tuple[ScriptedPolicy, ...]] = ()
+    scripted_defaults: ClassVar[Mapping[str, ScriptedPolicy]] = {}
     clip: ClassVar[float] = 3.0
     statistics: ClassVar[tuple[Metric, ...]] = ()
     has_held_out_distribution: ClassVar[bool] = False
@@ -207,9 +216,9 @@ class Task(option_models.TaskOptions):
         """Return the terms of the observation, or terms, camera and privileged terms; by default the phase."""
         return [ObservationTerm("phase")]
 
-    @abstractmethod
     def rewards(self) -> Mapping[str, Callable[..., float]]:
-        """Return the terms of a control step's reward by name, functions of signals."""
+        """Return the terms of a control step's reward by name, functions of signals; by default 1 for a success."""
+        return {"terminal_reward": terminal_reward({Termination.SUCCESS: 1.0})}
 
     @abstractmethod
     def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
@@ -245,23 +254,3 @@ class Task(option_models.TaskOptions):
     def scene(self) -> Scene:
         """Return the contents of a picture other than the robot, the camera and the viewpoints."""
         return Scene(to_world=in_plane)
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = option_models.STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return scripted policies by name; the first one is the default for `difficulty`.
-
-        A scripted policy takes the observation, (n,), centered, scaled and clipped as `observe` declares it, and
-        returns an action, (A,), in [−1, 1]. `guiderail evaluate` runs the default one as a baseline, unless the
-        observation is an image. An override must be a class method or a static method.
-        """
-        return {}
-
-    @classmethod
-    def folder_digest(cls) -> str:
-        """Return a digest of the files of `folder`; "" if the task has no folder."""
-        return ""
-
-    @classmethod
-    def supports(cls, station: str) -> bool:
-        """Return True if the task can use a station for its kind of workcell."""
-        return True

@@ -20,6 +20,7 @@ from guiderail.models.templates.transitions import TransitionDistance
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
 MAX_START_DISTANCE = 0.2  # largest distance of a start from the constraints [m]; a larger value is probably in mm
 MAX_START_ANGLE = 1.0  # largest angle between a start and the constraints [rad]; a larger value is probably in degrees
+MAX_SPEED_RATIO = 1.0 + 1e-9  # accepted speed relative to its limit: rounding errors must not decide
 BACKTRACKS = 8  # number of attempts to find an allowed displacement, each with a shorter displacement
 
 
@@ -228,16 +229,16 @@ class SharedControlTemplate:
             for constraint in constraints:
                 X_WE = constraint.project(X_WE, frames)
             ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
-            if ratio <= 1.0 and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
+            if ratio <= MAX_SPEED_RATIO and largest(each.violation(X_WE, frames) for each in constraints) <= INSIDE:
                 return Command(X_WE, fraction)
-            fraction *= 0.98 / ratio if ratio > 1.0 else 0.5
+            fraction *= 0.98 / ratio if ratio > MAX_SPEED_RATIO else 0.5
         if self._is_inside(state, X_WLast, frames):
             return Command(X_WLast, 0.0)
         X_WE = X_WLast
         for constraint in constraints:
             X_WE = constraint.project(X_WE, frames)
         ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
-        return Command(X_WE if ratio <= 1.0 else between(X_WLast, X_WE, 1.0 / ratio), 0.0)
+        return Command(X_WE if ratio <= MAX_SPEED_RATIO else between(X_WLast, X_WE, 1.0 / ratio), 0.0)
 
     def _constraints_at(
         self, state: int, X_WLast: RigidTransform, frames: Frames
@@ -254,7 +255,8 @@ class SharedControlTemplate:
     def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
         """Return True if one period is enough to move from the last command into a state's active constraints."""
         X_WE = self.project(state, X_WLast, frames)
-        return self._speed_ratio(state, X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
+        is_reachable = self._speed_ratio(state, X_WLast, X_WE, period_s) <= MAX_SPEED_RATIO
+        return is_reachable and self._is_inside(state, X_WE, frames)
 
     def _is_inside(self, state: int, X_WE: RigidTransform, frames: Frames) -> bool:
         return self.violation(state, X_WE, frames) <= INSIDE

@@ -65,11 +65,6 @@ def declare(of=Own, **attributes):
     return register_task("lab/Own")(type("Declared", (of,), {**attributes, "__module__": __name__}))
 
 
-def test_scripted_policies_of_an_instance_are_refused():
-    with pytest.raises(InputError, match="scripted_policies of lab/Own is called without an instance"):
-        declare(scripted_policies=lambda self, difficulty: {})
-
-
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
@@ -85,7 +80,7 @@ def test_task_without_a_possible_environment_is_refused(attributes, message):
 
 
 def test_task_that_lacks_methods_is_refused_with_their_names():
-    message = "the class Declared lacks done, rewards, workcell: see `Task`"
+    message = "the class Declared lacks done, workcell: see `Task`"
     with pytest.raises(InputError, match=message):
         declare(of=Task, station=PlaneStation)
 
@@ -96,13 +91,29 @@ def test_default_guidance_has_an_effect():
     assert EnvConfig.resolve("lab/Own", {}).guidance == "kgrl"
 
 
-@pytest.mark.parametrize("kind", [classmethod, staticmethod])
-def test_scripted_policies_without_an_instance_are_accepted(kind):
+def test_scripted_policy_is_the_first_or_that_of_the_difficulty():
     def hold(observation):
         return np.zeros(2)
 
-    declare(scripted_policies=kind(lambda *arguments: {"hold": hold}))
+    def push(observation):
+        return np.ones(2)
+
+    declare(scripted_policies=(hold, push), scripted_defaults={"hard": push}, presets={"hard": {"history": 4}})
     assert find_scripted_policy("lab/Own", "scripted") is hold
+    assert find_scripted_policy("lab/Own", "scripted", "hard") is push
+    assert find_scripted_policy("lab/Own", "hold", "hard") is hold
+
+
+def test_default_reward_is_one_at_success():
+    declare(rewards=Task.rewards)
+    env = make_env("lab/Own", guidance="kmp")
+    env.reset(seed=0)
+    over, rewards = False, []
+    while not over:
+        _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+        rewards.append(reward)
+        over = terminated or truncated
+    assert sum(rewards) == float(info["termination"] == "success")
 
 
 def test_settings_of_another_guidance_are_accepted():

@@ -4,6 +4,7 @@ Baseline policies ignore the observation.
 """
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -128,7 +129,11 @@ def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
 
 def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
     """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task."""
-    return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
+    if task not in TASKS.names():
+        return {}
+    policies, defaults = TASKS.get(task).scripted_policies, TASKS.get(task).scripted_defaults
+    first = [defaults[difficulty]] if difficulty in defaults else []
+    return {policy.__name__: copy(policy) for policy in (*first, *policies)}  # a policy with state is not shared
 
 
 def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> PolicyFn:

@@ -23,22 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.sdf import (
-    ContactMaterial,
-    TriangleMesh,
-    at,
-    box,
-    collision,
-    cylinder,
-    cylindrical,
-    equal_area_radius,
-    generate_assets,
-    lathe,
-    mesh,
-    model,
-    strip,
-    visual,
-)
+from guiderail.models.objects import sdf
+from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh
 from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
 
 FOLDER = Path(__file__).parent
@@ -179,9 +165,9 @@ def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) 
             [[entry_left, chamfer], [entry_left - chamfer / d.slot_radius, 0.0]],
         ]
     )
-    return strip(
-        cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
-        cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
+    return sdf.strip(
+        sdf.cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
+        sdf.cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
     )
 
 
@@ -191,7 +177,7 @@ def _faces_between_entries(
     """Return the half of the mouth's flat face between the entries of the two slots, as quads (Q, 4, 3) [m]."""
     columns = slot_columns(dimensions)
     angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
-    return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))
+    return sdf.strip(sdf.cylindrical(radii[1], angles, height), sdf.cylindrical(radii[0], angles, height))
 
 
 def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
@@ -223,8 +209,8 @@ def _lip_edge(d: BncDimensions) -> tuple[float, float]:
 
 def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
     """Return a surface of revolution whose polygons have the areas of the circles."""
-    scale = equal_area_radius(1.0, BORE_SIDES)
-    return lathe([(radius * scale, height) for radius, height in profile], BORE_SIDES)
+    scale = sdf.equal_area_radius(1.0, BORE_SIDES)
+    return sdf.lathe([(radius * scale, height) for radius, height in profile], BORE_SIDES)
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
@@ -234,9 +220,9 @@ def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
     plain_angles = np.linspace(columns.angles[-1], np.pi + columns.angles[0], 9)
 
     def shell(angles: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> list[np.ndarray]:
-        low_in, high_in = (cylindrical(d.bore_radius, angles, height) for height in (low, high))
-        low_out, high_out = (cylindrical(d.ring_radius, angles, height) for height in (low, high))
-        return [strip(low_in, high_in), strip(high_out, low_out)]
+        low_in, high_in = (sdf.cylindrical(d.bore_radius, angles, height) for height in (low, high))
+        low_out, high_out = (sdf.cylindrical(d.ring_radius, angles, height) for height in (low, high))
+        return [sdf.strip(low_in, high_in), sdf.strip(high_out, low_out)]
 
     radii = (d.bore_radius, d.ring_radius)
     all_angles = np.concatenate([columns.angles, plain_angles[1:]])
@@ -246,7 +232,12 @@ def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
         + shell(plain_angles, 0.0, d.ring_length)
         + [_slot_walls(d, d.ring_radius, chamfer=0.0)]
         + [_faces_between_entries(d, radii, 0.0, 0.0, num_sides=24)]
-        + [strip(cylindrical(radii[0], all_angles, d.ring_length), cylindrical(radii[1], all_angles, d.ring_length))]
+        + [
+            sdf.strip(
+                sdf.cylindrical(radii[0], all_angles, d.ring_length),
+                sdf.cylindrical(radii[1], all_angles, d.ring_length),
+            )
+        ]
     )
     return TriangleMesh.from_quads(_both_halves(np.concatenate(quads)))
 
@@ -290,19 +281,19 @@ def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction) for metal in (BARREL, LUG))
-    center = at(z=d.barrel_height / 2)
-    barrel = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
-    pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
+    center = sdf.at(z=d.barrel_height / 2)
+    barrel = sdf.cylinder(sdf.equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
+    pad = (sdf.at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), sdf.cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", center, barrel, barrel_material)
-    contents += collision("barrel_end", center, barrel, replace(barrel_material, margin=MARGIN))
-    contents += visual("barrel_visual", center, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
-    contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
+    contents = sdf.collision("barrel", center, barrel, barrel_material)
+    contents += sdf.collision("barrel_end", center, barrel, replace(barrel_material, margin=MARGIN))
+    contents += sdf.visual("barrel_visual", center, sdf.cylinder(d.barrel_radius, d.barrel_height), NICKEL)
+    contents += sdf.collision("pad", *pad, PAD) + sdf.visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
-        lug = (at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
-        contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
-    return model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
+        lug = (sdf.at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), sdf.cylinder(d.lug_radius, lug_length))
+        contents += sdf.collision(f"lug_{number}", *lug, lug_material) + sdf.visual(f"lug_{number}_visual", *lug, BRASS)
+    return sdf.model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 
 
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
@@ -311,13 +302,15 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     `friction` applies to all of them but the seat.
     """
     d, ring = dimensions, replace(RING, friction=friction)
-    seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
-    shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
-    contents = "".join(collision(name, at(), mesh(f"bnc_{name}.obj"), ring) for name in ("face", "bore", "slots"))
-    contents += collision("seat", *seat, SEAT)
-    contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
-    contents += visual("shell_visual", *shell, BRASS)
-    return model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
+    seat = (sdf.at(z=d.seat_height + d.seat_thickness / 2), sdf.box(d.seat_width, d.seat_width, d.seat_thickness))
+    shell = (sdf.at(z=d.ring_length + d.shell_length / 2), sdf.cylinder(d.shell_radius, d.shell_length))
+    contents = "".join(
+        sdf.collision(name, sdf.at(), sdf.mesh(f"bnc_{name}.obj"), ring) for name in ("face", "bore", "slots")
+    )
+    contents += sdf.collision("seat", *seat, SEAT)
+    contents += sdf.visual("ring_visual", sdf.at(), sdf.mesh("bnc_ring.obj"), NICKEL)
+    contents += sdf.visual("shell_visual", *shell, BRASS)
+    return sdf.model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
 
 
 def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, str]:
@@ -336,7 +329,7 @@ def folder_of(dimensions: BncDimensions, friction: float = FRICTION) -> Path:
     """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments."""
     if (dimensions, friction) == (BncDimensions(), FRICTION):
         return FOLDER
-    return generate_assets(files, dimensions, friction)
+    return sdf.generate_assets(files, dimensions, friction)
 
 
 MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism between the slots; its face is then 7 µm inside the circle
@@ -402,7 +395,7 @@ Outline = list[list[float]]
 
 def _prism(outline: np.ndarray, d: BncDimensions) -> np.ndarray:
     angle, height = outline.T
-    return np.concatenate([cylindrical(radius, angle, height) for radius in (d.bore_radius, d.ring_radius)])
+    return np.concatenate([sdf.cylindrical(radius, angle, height) for radius in (d.bore_radius, d.ring_radius)])
 
 
 def _over_the_slot(d: BncDimensions) -> list[Outline]:

@@ -19,22 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.sdf import (
-    ContactMaterial,
-    TriangleMesh,
-    at,
-    box,
-    collision,
-    convex_mesh,
-    cylinder,
-    cylindrical,
-    generate_assets,
-    lathe,
-    mesh,
-    model,
-    strip,
-    visual,
-)
+from guiderail.models.objects import sdf
+from guiderail.models.objects.sdf import ContactMaterial, TriangleMesh
 from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls
 
 FOLDER = Path(__file__).parent
@@ -91,7 +77,7 @@ class GridClampDimensions:
 
 def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
     """Return the mesh of a profile of (radius, height) [m], with circumscribed polygons for circles."""
-    return lathe([(radius / np.cos(np.pi / NUM_SIDES), height) for radius, height in profile], NUM_SIDES)
+    return sdf.lathe([(radius / np.cos(np.pi / NUM_SIDES), height) for radius, height in profile], NUM_SIDES)
 
 
 def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
@@ -156,14 +142,16 @@ def slab_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
     half_cell, half_table = d.spacing / 2, d.table_width / 2
     on_cell = half_cell / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
     bottom, wall, mouth = (
-        cylindrical(radius, angles, height)
+        sdf.cylindrical(radius, angles, height)
         for radius, height in (
             (d.hole_radius, -d.hole_depth),
             (d.hole_radius, -d.hole_chamfer),
             (d.hole_radius + d.hole_chamfer, 0.0),
         )
     )
-    hole = np.concatenate([strip(bottom, wall), strip(wall, mouth), strip(mouth, cylindrical(on_cell, angles, 0.0))])
+    hole = np.concatenate(
+        [sdf.strip(bottom, wall), sdf.strip(wall, mouth), sdf.strip(mouth, sdf.cylindrical(on_cell, angles, 0.0))]
+    )
     quads = [hole + np.array([x, y, 0.0]) for x, y in d.peg_positions]
     # The cells without a hole, and the frame around the three by three cells.
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -196,18 +184,20 @@ def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
     d, peg_material, pad = dimensions, *(replace(surface, friction=friction) for surface in (PEG, PAD))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
-        contents += collision(f"peg_{number}", at(x, y), convex_mesh("grid_clamp_peg.obj"), peg_material)
-        shaft = (at(x, y, d.peg_length / 2), cylinder(d.peg_radius, d.peg_length))
-        contents += visual(f"peg_{number}_visual", *shaft, STEEL)
-    crest = at(z=d.peg_length - d.bead_depth)
-    contents += collision("bead", crest, convex_mesh("grid_clamp_bead.obj"), BEAD)
-    contents += visual("bead_visual", crest, mesh("grid_clamp_bead.obj"), ANODIZED)
+        contents += sdf.collision(f"peg_{number}", sdf.at(x, y), sdf.convex_mesh("grid_clamp_peg.obj"), peg_material)
+        shaft = (sdf.at(x, y, d.peg_length / 2), sdf.cylinder(d.peg_radius, d.peg_length))
+        contents += sdf.visual(f"peg_{number}_visual", *shaft, STEEL)
+    crest = sdf.at(z=d.peg_length - d.bead_depth)
+    contents += sdf.collision("bead", crest, sdf.convex_mesh("grid_clamp_bead.obj"), BEAD)
+    contents += sdf.visual("bead_visual", crest, sdf.mesh("grid_clamp_bead.obj"), ANODIZED)
     top = d.peg_length + d.body_height
-    body = (at(z=d.peg_length + d.body_height / 2), box(d.shoulder_width, d.shoulder_width, d.body_height))
-    contents += collision("pad", *body, pad)
-    contents += visual("body_visual", *body, GLASS)
-    contents += visual("stem_visual", at(z=top + STEM_LENGTH / 2), cylinder(STEM_RADIUS, STEM_LENGTH), STEEL)
-    return model("clamp", CLAMP_MASS, (0.0, 0.0, d.peg_length), 20.0 * MM, contents)
+    body = (sdf.at(z=d.peg_length + d.body_height / 2), sdf.box(d.shoulder_width, d.shoulder_width, d.body_height))
+    contents += sdf.collision("pad", *body, pad)
+    contents += sdf.visual("body_visual", *body, GLASS)
+    contents += sdf.visual(
+        "stem_visual", sdf.at(z=top + STEM_LENGTH / 2), sdf.cylinder(STEM_RADIUS, STEM_LENGTH), STEEL
+    )
+    return sdf.model("clamp", CLAMP_MASS, (0.0, 0.0, d.peg_length), 20.0 * MM, contents)
 
 
 def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
@@ -215,13 +205,13 @@ def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
     d, hole, face = dimensions, *(replace(surface, friction=friction) for surface in (HOLE, SLAB))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
-        contents += collision(f"hole_{number}", at(x, y), mesh("grid_clamp_hole.obj"), hole)
-    contents += collision("lip", at(), mesh("grid_clamp_lip.obj"), LIP)
-    contents += visual("lip_visual", at(), mesh("grid_clamp_lip.obj"), STEEL)
-    slab = at(z=-d.table_thickness / 2)
-    contents += collision("slab", slab, box(d.table_width, d.table_width, d.table_thickness), face)
-    contents += visual("slab_visual", at(), mesh("grid_clamp_slab.obj"), ALUMINIUM)
-    return model("table", 1.0, (0.0, 0.0, -d.table_thickness / 2), 30.0 * MM, contents)
+        contents += sdf.collision(f"hole_{number}", sdf.at(x, y), sdf.mesh("grid_clamp_hole.obj"), hole)
+    contents += sdf.collision("lip", sdf.at(), sdf.mesh("grid_clamp_lip.obj"), LIP)
+    contents += sdf.visual("lip_visual", sdf.at(), sdf.mesh("grid_clamp_lip.obj"), STEEL)
+    slab = sdf.at(z=-d.table_thickness / 2)
+    contents += sdf.collision("slab", slab, sdf.box(d.table_width, d.table_width, d.table_thickness), face)
+    contents += sdf.visual("slab_visual", sdf.at(), sdf.mesh("grid_clamp_slab.obj"), ALUMINIUM)
+    return sdf.model("table", 1.0, (0.0, 0.0, -d.table_thickness / 2), 30.0 * MM, contents)
 
 
 def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[str, str]:
@@ -241,7 +231,7 @@ def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Pa
     """Return the folder with the files of clamp and table: a temporary one, or this module's for default arguments."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
-    return generate_assets(files, dimensions, friction)
+    return sdf.generate_assets(files, dimensions, friction)
 
 
 # Each side of the bead has its own spring, as stiff as one side of Drake's compliant bead in the lip.

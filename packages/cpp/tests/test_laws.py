@@ -14,11 +14,6 @@ STEPS = 800
 FLAGS = {"optimized": ["-O2"], "sanitized": ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]}
 
 
-# Known differences of up to 1e-3 in two templates of every kind, since recordings step the law instead of a diagram.
-DIFFERENT = ("template of every kind, far", "template of every kind, near")
-CASES = [pytest.param(law, marks=pytest.mark.xfail(strict=True)) if law in DIFFERENT else law for law in LAWS]
-
-
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
     """Return the path of the program `replay` for each set of flags."""
@@ -32,7 +27,7 @@ def programs(tmp_path_factory):
 
 
 @needs_compiler
-@pytest.mark.parametrize("law", CASES)
+@pytest.mark.parametrize("law", LAWS)
 def test_law_equals_python_to_1e_12_without_allocations(law, programs, tmp_path):
     data, recording = (tmp_path / name for name in ("data.safetensors", "recording.safetensors"))
     for path, content in zip((data, recording), LAWS[law](STEPS), strict=True):

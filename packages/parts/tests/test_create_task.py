@@ -20,6 +20,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
+from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.train import train
 from guiderail_parts import create_task as create_task_module
@@ -677,7 +678,7 @@ def test_search_acts_equally_on_the_shared_observation(folder):
     actions = {}
     for name in ("center_of_pressure", "shared"):
         env = shared(folder, observation=name)
-        search = env.diagram.task.scripted_policies("hard")["scripted_search"]
+        search = find_scripted_policy(env.diagram.task.name, "scripted_search")
         observation, _ = env.reset(seed=1)
         actions[name] = []
         while True:

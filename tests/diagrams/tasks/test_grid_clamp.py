@@ -6,7 +6,6 @@ import pytest
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.grid_clamp import (
     CENTER,
-    COLLISION_FORCE,
     MAX_TRACKING_ERROR,
     SCALE,
     STIFFNESS,
@@ -16,6 +15,7 @@ from guiderail.diagrams.tasks.grid_clamp import (
     straight_descent,
 )
 from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.transforms import MM
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 

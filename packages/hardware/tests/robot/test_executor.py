@@ -259,6 +259,15 @@ def test_hardware_environment_drops_simulation_options(monkeypatch):
     assert "end_effector" not in executing.hardware_environment("BncConnector", environment, "hardware")
 
 
+def test_hardware_environment_drops_disturbances_and_keeps_the_tare():
+    options = {"station": "arm", "sensing": "wrist", "sensing.wrench_bias": [1.0, 0.1], "sensing.tare": True}
+    options |= {"disturbances.friction_factor": [0.5, 2.0], "disturbances.payload": 0.1}
+    environment = executing.hardware_environment("BncConnector", options, "hardware")
+    assert {name: environment[name] for name in environment if name != "station"} == {
+        "sensing": "wrist", "sensing.tare": True,
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(("reward", "on_hardware"), [("aligned", "sparse"), ("shaped", "shaped")])
 def test_hardware_environment_replaces_a_privileged_reward(reward, on_hardware):
     environment = EnvConfig.resolve("BncConnector", {"station": "arm", "reward": reward}).options

@@ -17,7 +17,7 @@ from pydrake.systems.primitives import Multiplexer
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed, affine
-from guiderail.diagrams.envs.options import STANDARD, Number
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.guidance.prior import Prior
@@ -37,10 +37,9 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    FixtureOffsetOptions,
-    ForceOptions,
+    length_field,
 )
-from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
+from guiderail.diagrams.tasks.task import Condition
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
@@ -151,37 +150,10 @@ COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale 
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
-class PartOptions(FixtureOffsetOptions, ForceOptions):
-    """Options of a task of two meshes."""
-
-    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
-    observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
-        "state", description="name of the observation"
-    )
-
-    offset_shape: Literal["ring", "square"] = Field(
-        "ring",
-        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
-        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
-    )
-    fixture_turn: Number = Field(
-        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
-    )
-    bound: Number | None = Field(
-        None,
-        ge=0.5 * MM,
-        le=6.0 * MM,
-        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
-    )
-    start_offset_max: Number = Field(
-        0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
-    )
-
-
 class PartUncertainty(BncUncertainty):
     """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square."""
 
-    def __init__(self, options: PartOptions):
+    def __init__(self, options: PartInsertion):
         super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
         self.is_square = options.offset_shape == "square"
 
@@ -203,6 +175,8 @@ class ScriptedSearch:
     search integrates the action and not the displacement, because the displacement per action depends on the guidance
     and changes during the motion.
     """
+
+    __name__ = "scripted_search"
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
         """Construct the policy.
@@ -251,7 +225,7 @@ class ScriptedSearch:
         return self._action.copy()
 
 
-class PartInsertion(PartOptions, DemonstratedInsertion):
+class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
@@ -265,6 +239,27 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
     simulated_rewards = ("aligned",)
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]  # content of `task.yaml`
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
+        "state", description="name of the observation"
+    )
+
+    offset_shape: Literal["ring", "square"] = Field(
+        "ring",
+        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
+        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
+    )
+    fixture_turn: Number = Field(
+        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
+    )
+    bound: Number | None = Field(
+        None,
+        ge=0.5 * MM,
+        le=6.0 * MM,
+        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
+    )
+    start_offset_max: Number = length_field(0.0, 0.0, 2.0 * MM, "largest sampled offset of the start along x and y")
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
@@ -315,16 +310,6 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
     @cached_property
     def _workcell(self) -> PartWorkcell:
         return write_workcell(self.folder, self.file)
-
-    @classmethod
-    def supports(cls, station: str) -> bool:
-        """Return True for every station, except that MuJoCo needs convex pieces."""
-        return cls.file.is_convex or station != "mujoco"
-
-    @classmethod
-    def folder_digest(cls) -> str:
-        """Return the digest of the task folder; see `task_folder_digest`."""
-        return task_folder_digest(cls.folder)
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the folder's demonstrations."""
@@ -378,12 +363,6 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
             if direction[0] * x + direction[1] * y >= play + MIN_PUSH:
                 tests.append(HoldTest((x, y, 0.0), play + MAX_HOLD_MOTION))
         return tests
-
-    @classmethod
-    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return the scripted search by the center of pressure."""
-        reference = partial(cls.file.demonstrations.reference, cls.folder)
-        return {"scripted_search": ScriptedSearch(cls.file, lambda: reference().num_steps * CONTROL_PERIOD)}
 
     def observe(self) -> Observed:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
@@ -560,10 +539,14 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "time_step": file.time_step,
         **file.recommended.environment,
     }
+    reference = partial(file.demonstrations.reference, folder)
     members = {
         "name": file.name,
+        "scripted_policies": (ScriptedSearch(file, lambda: reference().num_steps * CONTROL_PERIOD),),
+        "unsupported_stations": () if file.is_convex else ("mujoco",),  # MuJoCo needs convex pieces
         "presets": {"hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
+        "digest": content,
         "file": file,
         "defaults": defaults,
         "learner": file.recommended.learner,

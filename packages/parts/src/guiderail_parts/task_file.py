@@ -12,9 +12,16 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
+from guiderail.diagrams.envs.options import Number, Numbers, Options, TaskOptions, validate_options
 from guiderail.diagrams.stations.options import CONTROL_PERIOD, ContactOptions
-from guiderail.diagrams.tasks.options import COLLISION_FORCE, REPEATABILITY_STD, PriorOptions, reference_of_file
+from guiderail.diagrams.tasks.options import (
+    FORCE_LIMITS,
+    REPEATABILITY_STD,
+    PriorStd,
+    force_limit_field,
+    prior_std_field,
+    reference_of_file,
+)
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean
@@ -221,9 +228,10 @@ def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
     return np.where(np.isnan(numbers), missing, numbers)
 
 
-class DemonstrationFile(PriorOptions):
+class DemonstrationFile(TaskOptions):  # the base class is part of the digest that runs store
     """Demonstrations in the task folder, and the fit of their reference trajectory."""
 
+    prior_std: PriorStd | None = prior_std_field()
     file: str = Field("demonstrations.npz", description="file .npz or .csv of poses in the target frame")
     components: int | None = Field(
         None,
@@ -299,9 +307,7 @@ class PartTaskFile(Options):
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
-    force_limit: Number = Field(
-        COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
-    )
+    force_limit: Number = force_limit_field(FORCE_LIMITS[0])
     time_step: Number | None = Field(None, gt=0, description="time step of the simulation [s]; default: the station's")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="largest slip speed of a sticking contact [m/s]")
     demonstrations: DemonstrationFile = DemonstrationFile.model_validate({})

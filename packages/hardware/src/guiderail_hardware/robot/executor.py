@@ -20,6 +20,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.envs.options import Options, choices_of, option_fields
 from guiderail.diagrams.envs.trace import EpisodeTrace
+from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.registry import TASKS
@@ -410,9 +411,10 @@ def recordings_folder(run: Path) -> Path:
 
 
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
-    """Return a run's environment options without the options of the station that it was trained on.
+    """Return a run's environment options without those of the station that it was trained on and its disturbances.
 
-    A reward that needs simulation state is replaced by the task's first reward without it; no policy uses rewards.
+    A real robot has disturbances of its own; only `sensing` and the tare remain. A reward that needs simulation state
+    is replaced by the task's first reward without it; no policy uses rewards.
 
     Raises:
         InputError: If `station` is unknown or simulated.
@@ -420,8 +422,9 @@ def hardware_environment(task: str, environment: Mapping[str, Any], station: str
     if STATIONS.get(station).is_simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there with guiderail visualize")
     config = EnvConfig.resolve(task, environment)
-    training_options = config.station_kind.options or Options
-    options = {name: value for name, value in environment.items() if name not in option_fields(training_options)}
+    disturbances = {name for name, field in option_fields(Disturbances).items() if field not in ("sensing", "tare")}
+    simulated_options = disturbances | option_fields(config.station_kind.options or Options).keys()
+    options = {name: value for name, value in environment.items() if name not in simulated_options}
     task_class = TASKS.get(config.task)
     simulated = getattr(task_class, "simulated_rewards", ())
     if environment.get("reward") in simulated:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
-from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.registry import TASKS, content_digest
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
@@ -115,7 +115,7 @@ class Protocol(Strict):
         """Return the digest of everything in the protocol that the results on a task depend on."""
         task = self.tasks[name].model_dump(include={"task", "env", "episodes"})
         common = self.model_dump(mode="json", include={"version", "episodes", "first_seed"})
-        content = TASKS.get(self.resolve_task(name)[0]).folder_digest()
+        content = content_digest(TASKS.get(self.resolve_task(name)[0]))
         text = json.dumps([common, task, content], sort_keys=True)
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 

@@ -194,13 +194,13 @@ class Template {
     for (int attempt = 0; attempt < kBacktracks; ++attempt) {
       const Transform X = project(state, between(last, request, fraction), true);
       const double ratio = speed_ratio(state, last, X, period);
-      if (ratio <= 1.0 && violation(state, X, true) <= kInside) return X;
-      fraction *= ratio > 1.0 ? 0.98 / ratio : 0.5;
+      if (ratio <= kMaxSpeedRatio && violation(state, X, true) <= kInside) return X;
+      fraction *= ratio > kMaxSpeedRatio ? 0.98 / ratio : 0.5;
     }
     if (violation(state, last) <= kInside) return last;
     const Transform X = project(state, last, true);
     const double ratio = speed_ratio(state, last, X, period);
-    return ratio <= 1.0 ? X : between(last, X, 1.0 / ratio);
+    return ratio <= kMaxSpeedRatio ? X : between(last, X, 1.0 / ratio);
   }
 
   // Largest violation of an active constraint [m or rad]; 0 inside.
@@ -261,7 +261,7 @@ class Template {
   }
 
  private:
-  static constexpr double kInside = 1e-9, kNearAxis = 1e-9, kClearance = 1e-8;
+  static constexpr double kMaxSpeedRatio = 1.0 + 1e-9, kInside = 1e-9, kNearAxis = 1e-9, kClearance = 1e-8;
   static constexpr int kBacktracks = 8;
   static constexpr double kTurn = 6.283185307179586;
 
@@ -340,7 +340,7 @@ class Template {
 
   bool can_enter(int state, const Transform& last, double period) const {
     const Transform X = project(state, last, false);
-    return speed_ratio(state, last, X, period) <= 1.0 && violation(state, X) <= kInside;
+    return speed_ratio(state, last, X, period) <= kMaxSpeedRatio && violation(state, X) <= kInside;
   }
 
   // Pose after the active constraints of a state in their order; constraints in the same frame form a group.
@@ -632,7 +632,7 @@ class TemplateGuidance {
         for (int i = 0; i < 6; ++i) is_constrained_ = is_constrained_ || !(std::abs(desired[i] - requested[i]) <= 1e-9);
         const Vec3 measured{measured_[0], measured_[1], measured_[2]};
         const double error = distance({last_[0], last_[1], last_[2]}, measured);
-        const bool reduces_error = distance({desired[0], desired[1], desired[2]}, measured) < error;
+        const bool reduces_error = distance({desired[0], desired[1], desired[2]}, measured) < error - kRounding;
         const bool is_waiting = error > max_tracking_error_ && !reduces_error;
         if (!is_waiting && is_finite(desired.data(), 6)) {
           output_ = desired;
@@ -653,6 +653,8 @@ class TemplateGuidance {
   void constrain(const std::array<double, 6>& requested, std::array<double, 6>& desired) {
     transform_to_pose(template_.command(state_, pose_to_transform(last_.data()), pose_to_transform(requested.data()), period_), desired.data());
   }
+
+  static constexpr double kRounding = 1e-9;
 
   Template template_, mapping_;
   bool has_own_mapping_;

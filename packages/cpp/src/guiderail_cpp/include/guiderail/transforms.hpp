@@ -1,8 +1,7 @@
 // Rotations and poses [x y z Rz Ry Rx], by the formulas of guiderail.models.common.transforms in their order of operations.
 //
-// Products are fused multiply-adds in the order of NumPy's matrix products on processors with this instruction. A law
-// that compares with a limit, such as the largest speed, then takes the same branch as in Python: at the limit the last
-// bit decides.
+// Products are fused multiply-adds in the order of NumPy's matrix products on processors with this instruction, so that
+// long recordings differ from Python's by few rounding errors.
 #pragma once
 
 #include <algorithm>
