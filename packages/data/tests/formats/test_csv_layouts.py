@@ -272,21 +272,10 @@ def test_incomplete_quaternion_is_refused_by_name(layout, missing, file):
 @pytest.mark.parametrize(
     "names",
     [
-        "yaw",
-        "roll,yaw",
-        "heading",
-        "w",
-        "W,P,R",
-        "A,B",
-        "euler_x,euler_y,euler_z",
-        "r11,r12,r13",
-        "phi,theta,psi",
-        "quat[0],quat[1]",
-        "axis_angle_x",
-        "angle_deg",
-        "O_T_EE_0",
+        "yaw", "roll,yaw", "heading", "w", "W,P,R", "A,B", "euler_x,euler_y,euler_z", "r11,r12,r13", "phi,theta,psi",
+        "quat[0],quat[1]", "axis_angle_x", "angle_deg", "O_T_EE_0",
     ],
-)
+)  # fmt: skip
 def test_unknown_orientation_is_never_dropped(names, file):
     write(file, f"t,x_m,y_m,z_m,{names}", *range(4 + names.count(",")))
     with pytest.raises(InputError, match=f"has {re.escape(names.split(',')[0])}.* not the whole of an orientation"):
