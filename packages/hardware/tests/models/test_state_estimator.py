@@ -669,6 +669,25 @@ def test_moving_robot_in_the_same_posture_is_not_adopted(order):
     assert number * PERIOD < 0.04
 
 
+@pytest.mark.parametrize(
+    ("speed", "expected"), [(0.105, (8, Fault.NOT_REACTING)), (0.15, (8, Fault.NOT_REACTING)), (0.07, None)]
+)
+def test_unexplained_velocity_is_a_fault_after_the_maximum_age(speed, expected):
+    """The second robot moves like the first one plus a constant speed just above the errors of the torques."""
+    rig, number = Rig().settle(), iter(range(1, 100))
+    difference = np.array([speed, 0.0])
+
+    def imitate(true):
+        return replace(
+            true,
+            positions=true.positions + next(number) * PERIOD * difference,
+            velocities=true.velocities + difference,
+        )
+
+    assert rig.detected(imitate, 30) == expected
+    assert 8 * PERIOD > LIMITS.max_age > 7 * PERIOD
+
+
 def test_collision_is_accepted_when_its_external_torque_is_reported():
     """Without it, the prediction does not agree, and the statuses are not used."""
     rig = Rig(external=np.zeros(2)).settle()

@@ -283,7 +283,7 @@ class StateEstimator:
             # The prediction, unlike the sums of momentum, does not decay.
             deviation = np.abs(values[self._velocities] - state.velocity)
             is_contradictory |= status.time - before.accepted_time > self._limits.max_age
-        is_explained = is_doubted or (deviation <= explained).all()
+        is_explained = (deviation <= explained).all()
         fault = fault or self._find_contradiction(state, bool(is_contradictory and not is_explained))
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
