@@ -455,9 +455,11 @@ def test_unchecked_demonstrations_are_not_reported_as_failed(counts, stored, sen
     refusal = pytest.raises(InputError, match="none of the 3 checked demonstrations seats the plug")
     with refusal if stored is None else nullcontext():
         measured = create_task_module._write_task(
-            tmp_path, file, choice, {"real_time_factor": 1.0}, 0, 0.0, logged.append
+            tmp_path, file, choice, {"real_time_factor": 1.0, "force": 6.0}, 0, 0.0, logged.append
         )
         assert measured["demonstrations_seated"] == stored
+        written = yaml.safe_load((tmp_path / "task.yaml").read_text())
+        assert written["recommended"]["environment"]["force_limit"] == 15.0  # 2.5 times the force
     assert all(text.startswith(start) for text, start in zip(logged[1:], sentences, strict=True))
 
 

@@ -409,10 +409,13 @@ def _write_task(
     log: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
-    from guiderail_parts.difficulty import calibrate
+    from guiderail_parts.difficulty import calibrate, force_limit_of
     from guiderail_parts.task_file import write_task_file
     from guiderail_parts.trial import demonstrate, num_components, write_preview
 
+    # The friction of a plug that is pressed harder than an insertion needs holds it on the rim.
+    environment = file.recommended.environment | {"force_limit": force_limit_of(file, measured["force"])}
+    file = file.model_copy(update={"recommended": file.recommended.model_copy(update={"environment": environment})})
     duration = float(file.motion.plan_search()[0][-1])
     factor = max(measured["real_time_factor"], 0.01)  # rounding may make it 0
     log(f"recording demonstrations: about {NUM_DEMONSTRATIONS * duration / factor:.0f} s")

@@ -258,7 +258,7 @@ class Recommended(Options):
     environment: dict[str, Any] = Field(
         {
             "fixture_offset": "per_episode",
-            "offset_range": (1.5 * MM, 2.0 * MM),  # too large for a straight insertion, within the default bounds
+            "offset_range": (1.0 * MM, 1.5 * MM),  # too large for a straight insertion
             "observation": "center_of_pressure",
             "reward": "aligned",
             "action_repeat": 5,
@@ -306,7 +306,10 @@ class PartTaskFile(Options):
     scenario: tuple[str, ...] = Field((), description="Drake model directives (.dmd.yaml) of further objects")
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
-    bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
+    # Beyond the default offsets, because friction holds a plug on the rim up to 1 mm behind the command.
+    bounds: Bounds = Bounds.model_validate(
+        {"lower": (-2.75e-3, -2.75e-3, *[None] * 4), "upper": (2.75e-3, 2.75e-3, *[None] * 4)}
+    )
     force_limit: Number = force_limit_field(FORCE_LIMITS[0])
     time_step: Number | None = Field(None, gt=0, description="time step of the simulation [s]; default: the station's")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="largest slip speed of a sticking contact [m/s]")
