@@ -498,7 +498,7 @@ class Campaign:
         return max(self.ask(do="predict", targets=ahead)["speeds"])
 
     def inject(self, kinds: tuple[Kind, ...], seed: list[int]) -> Result:
-        """Inject one or more faults at the same time, and observe the arm for `DURATION`."""
+        """Inject one or more faults at the same time, and observe the arm for at least `DURATION`."""
         result, first_step, start = Result(np.nan, "", 0.0, 0.0, []), self.step, None
         bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
         self.ask(do="begin", kinds=[kind.name for kind in kinds], seed=seed)
@@ -511,7 +511,8 @@ class Campaign:
             start = self.step
         reach = round((bound if np.isfinite(bound) else DURATION) / PERIOD) + 4
         speed, elapsed = 0.0, 0.0
-        while elapsed < DURATION - 1e-9 and self.step - first_step < MAX_STEPS:
+        duration = max(DURATION, np.nan_to_num(bound) + SLOW_AFTER)
+        while elapsed < duration - 1e-9 and self.step - first_step < MAX_STEPS:
             before = self.speed
             self.step_once()
             if start is None and self.has_effect:
