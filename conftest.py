@@ -22,8 +22,17 @@ WITH_HANDLERS = (
 )  # fmt: skip
 
 
+# Files that take longest. They run first, so that no worker begins one of them while the others have nothing left.
+SLOW = (
+    "parts/tests/test_create_task.py", "calibration/tests/test_calibrate.py", "docs/test_tutorials.py",
+    "third_party/test_peglab.py", "cpp/tests/test_export.py", "cpp/tests/test_laws.py", "robot/test_train.py",
+    "diagrams/tasks/test_contact_probe.py", "parts/tests/test_batch.py", "docs/test_notebooks.py",
+)  # fmt: skip
+
+
 def pytest_collection_modifyitems(items):
-    """Skip the tests with LCM handlers if a handler would end the process."""
+    """Order the files, and skip the tests with LCM handlers if a handler would end the process."""
+    items.sort(key=lambda item: not item.path.as_posix().endswith(SLOW))
     if find_spec("guiderail_hardware") is None:  # the tests of another sibling, without this one
         return
     from guiderail_hardware.drivers.lcm import handlers_are_safe

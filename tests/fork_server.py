@@ -14,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import traceback
+from collections.abc import Sequence
 from multiprocessing import forkserver, resource_tracker, util
-from typing import TextIO
+from typing import Any, TextIO
 
 # Packages that take long to import. Modules of guiderail are not preloaded, because imports fill its registries.
 PRELOADED = (
@@ -26,9 +27,27 @@ PRELOADED = (
 
 
 class Forks:
-    """Connection to a server process that runs programs in forks of this process."""
+    """Connection to a server process that runs programs in forks of this process, or of a new interpreter.
 
-    def __init__(self) -> None:
+    Args:
+        interpreter: Path of the new interpreter, which imports the common packages; None to fork this process.
+        preloaded: Modules that the new interpreter imports, too.
+        keywords: Arguments of `subprocess.Popen` for a new interpreter.
+    """
+
+    def __init__(self, interpreter: str | None = None, preloaded: Sequence[str] = (), **keywords: Any) -> None:
+        self._process = None
+        if interpreter is not None:
+            self._process = subprocess.Popen(
+                [interpreter, __file__, *preloaded],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                **keywords,
+            )
+            self._requests, self._responses = self._process.stdin, self._process.stdout
+            assert self._responses.readline() == "ready\n"
+            return
         parent_end, child_end = socket.socketpair()
         self._server = os.fork()
         if not self._server:
@@ -49,7 +68,7 @@ class Forks:
     def close(self) -> None:
         """Stop the server."""
         self._requests.close(), self._responses.close()
-        os.waitpid(self._server, 0)
+        os.waitpid(self._server, 0) if self._process is None else self._process.wait()
 
 
 def start_forkserver() -> None:
@@ -126,7 +145,7 @@ def serve(requests: TextIO, responses: TextIO) -> None:
 
 def main() -> None:
     """Import the common packages, print "ready", and serve requests from the standard input."""
-    for name in PRELOADED:
+    for name in (*PRELOADED, *sys.argv[1:]):
         __import__(name)
     print("ready", flush=True)
     serve(sys.stdin, sys.stdout)

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from guiderail import Demonstrations
+from guiderail import Demonstrations, GuidedEnv
 
 PERIOD = 0.05  # of a step [s]
 MAX_STEP = 0.04  # largest displacement along each axis in a step [m]
@@ -68,3 +68,9 @@ def demonstrations(end=(0.0, 0.0, 0.0), steps=25, count=5, seed=0, start=(-0.5, 
         bend = rng.normal(scale=0.03, size=3)
         outputs.append((1 - s) * np.array(start) + s * np.array(end) + 4 * s * (1 - s) * bend)
     return Demonstrations([t] * count, outputs)
+
+
+def guided(env, **more):
+    """Return the environment with guidance to its target; `more` are arguments of `GuidedEnv`."""
+    keywords = {"pose": pose, "to_action": to_action, "period": PERIOD, "demonstrations": demonstrations()}
+    return GuidedEnv(env, frame=lambda env, observation: env.unwrapped.target, **keywords | more)

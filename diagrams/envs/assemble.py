@@ -24,13 +24,7 @@ from guiderail.diagrams.envs.observation import (
     affine,
 )
 from guiderail.diagrams.envs.options import PrimitiveOptions, validate_options
-from guiderail.diagrams.envs.scene import (
-    add_camera,
-    add_meshcat,
-    add_picture,
-    contact_results_of,
-    scene_of,
-)
+from guiderail.diagrams.envs.scene import add_camera, add_meshcat, add_picture, contact_results_of, scene_of
 from guiderail.diagrams.envs.task_diagram import Symmetry, TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PlacedTemplate, PrimitiveConfig, PriorKnowledge, limits_per_output
@@ -317,6 +311,18 @@ class Loop:
         self.signals.connect(reward, terms, user)
         return reward
 
+    def build(
+        self, render_mode: str | None, before_build: Callable[[DiagramBuilder], object] | None, suffix: str = ""
+    ) -> Diagram:
+        """Add a picture and the systems of `before_build`; build the root diagram, named by the task and `suffix`."""
+        if render_mode == "rgb_array":
+            add_picture(self.builder, self.station, self.task.scene().camera, self.task.name)
+        if before_build is not None:
+            before_build(self.builder)
+        diagram = self.builder.Build()
+        diagram.set_name(self.task.name.replace("/", "_") + suffix)
+        return diagram
+
 
 def build_task_diagram(
     config: EnvConfig,
@@ -375,12 +381,7 @@ def build_task_diagram(
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
-    if render_mode == "rgb_array":
-        add_picture(builder, station, task.scene().camera, task.name)
-    if before_build is not None:
-        before_build(builder)
-    diagram = builder.Build()
-    diagram.set_name(task.name.replace("/", "_"))
+    diagram = loop.build(render_mode, before_build)
     symmetry, near_symmetry = _symmetries(config, station) if config.guidance_kind.displaces else (None, None)
     return TaskDiagram(
         diagram=diagram,
@@ -456,12 +457,7 @@ def build_skill_diagram(
     for name in OUTPUTS:
         builder.ExportOutput(guidance.GetOutputPort(name), name)
     meshcat = add_meshcat(builder, scene_of(station), contact_results_of(station)) if render_mode == "human" else None
-    if render_mode == "rgb_array":
-        add_picture(builder, station, task.scene().camera, task.name)
-    if before_build is not None:
-        before_build(builder)
-    diagram = builder.Build()
-    diagram.set_name(f"{task.name.replace('/', '_')}_skill")
+    diagram = loop.build(render_mode, before_build, suffix="_skill")
     return SkillDiagram(
         diagram,
         station.control_period,

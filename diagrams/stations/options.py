@@ -71,16 +71,6 @@ class GantryOptions(ContactOptions):
     )
 
 
-class HardwareOptions(Options):
-    """Options of a station with a real arm."""
-
-    robot: str = Field(DEFAULT_ROBOT, description="name of the arm")
-    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="name of the tool on the flange")
-    driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
-    robot_url: str = Field("", description="LCM URL of the driver's bus, or host of the robot; default: LCM's default")
-    robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
-
-
 Sensing = Literal["exact", "wrist", "robot"]
 
 TARE_SKIPPED, TARE_AVERAGED = 3, 5

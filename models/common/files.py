@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 import threading
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -60,19 +60,6 @@ def read_bytes(path: Path, what: str, max_size: int) -> bytes:
     if len(data) > max_size:
         raise InputError(f"the {what} '{path}' is larger than {max_size} bytes: leave out what is not needed")
     return data
-
-
-def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
-    """Return the paths of the files in a folder with one of the endings, in order; hidden files are left out.
-
-    Raises:
-        InputError: If the name of a folder has one of the endings.
-    """
-    paths = [path for path in folder.iterdir() if path.suffix in endings and not path.name.startswith(".")]
-    for path in paths:
-        if path.is_dir():
-            raise InputError(f"{path} is a folder with the name of a file: rename it, or move it to another place")
-    return in_order(paths)
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:

@@ -14,6 +14,8 @@ from guiderail.models.laws.law import Command, Law
 from guiderail.models.templates.parts import Frames
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 
+ROUNDING = 1e-9  # smallest reduction of a tracking error that counts [m]
+
 
 def requested_pose(
     template: SharedControlTemplate,
@@ -126,7 +128,7 @@ class TemplateLaw(Law):
         if np.isfinite(requested).all() and np.isfinite(measured).all():
             desired = self._allowed(number, last, requested, frames)
             tracking_error = math.dist(last[:3], measured[:3])
-            reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
+            reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error - ROUNDING
             is_waiting = tracking_error > self._max_tracking_error and not reduces_error
             if not is_waiting and np.isfinite(desired).all():
                 return desired, False

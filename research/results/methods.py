@@ -31,7 +31,7 @@ HARD_TASKS_COLUMNS = (
 )  # fmt: skip
 # Columns and rows of the README's table of hard tasks: without an effect, and with an effect of template and primitive.
 README_COLUMNS = 5
-README_TITLES = ("Connector, hard, contact at 10 ms", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
+README_TITLES = ("Connector, hard, converged contact", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
 MISSING = "–"
 ALWAYS = (0, 2)  # columns that every table of methods has: name and success
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"

@@ -151,9 +151,9 @@ evaluates; `research/results/engines.csv` has forces, violations and the trainin
 
 {table}
 
-**All other tables on this page are an appendix: they were measured in the contact of that time at a plant step of
-10 ms**, which had not converged ([why](../experiments.md#converged-contact-of-the-connector)). They compare methods in
-that contact.
+**All tables below, except "converged contact", are an appendix: they were measured in the contact of that time at a
+plant step of 10 ms**, which had not converged ([why](../experiments.md#converged-contact-of-the-connector)). They
+compare methods in that contact.
 """
 
 

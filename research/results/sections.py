@@ -56,6 +56,17 @@ _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
 SECTIONS: dict[str, list[Section]] = {
     "BncConnector": [
         Section(
+            "Connector, hard, converged contact",
+            [
+                Row("KGRL", "connector_hard_converged", "kgrl"),
+                Row("sKGRL, adaptive history", "connector_hard_converged", "skgrl_adaptive"),
+                Row("residual RL", "connector_hard_converged", "residual"),
+                Row("safe residual RL", "connector_hard_converged", "safe_residual"),
+                *_baselines("connector_hard_converged", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL", "sKGRL, adaptive history"),
+        ),
+        Section(
             "Connector, hard, on an iiwa with a robot's sensors, contact at 10 ms",
             [
                 Row("KGRL", "connector_robot_sensing", "kgrl"),

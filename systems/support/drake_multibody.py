@@ -1,4 +1,4 @@
-"""Conversion between poses and Drake's rigid transforms, and joint dynamics and limits of a plant."""
+"""Conversion between poses and Drake's rigid transforms, and checks of a plant's frames and bodies."""
 
 from collections.abc import Sequence
 
@@ -6,28 +6,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody
-from pydrake.systems.framework import Context
 
 from guiderail.models.common.errors import InputError
-
-
-class JointDynamics:
-    """Mass matrix of an arm, and its joint torques of Coriolis forces and joint damping.
-
-    Args:
-        plant: Finalized model of only the arm and its payload.
-    """
-
-    def __init__(self, plant: MultibodyPlant):
-        self._plant, self._damping = plant, np.zeros(plant.num_velocities())
-        for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
-            start = joint.velocity_start()  # the order of velocities can differ from the order of joints
-            self._damping[start : start + joint.num_velocities()] = joint.default_damping_vector()
-
-    def evaluate(self, plant_context: Context) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mass matrix (n, n) and the torques of Coriolis forces and damping (n,) [Nm]."""
-        drag = self._plant.CalcBiasTerm(plant_context) + self._damping * self._plant.GetVelocities(plant_context)
-        return self._plant.CalcMassMatrix(plant_context), drag
 
 
 def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Frame) -> None:

@@ -1,14 +1,13 @@
 """Notebooks in `examples/notebooks`: the cells run in order, and no output is stored."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from fork_server import Forks
 
 SHORTEN_PICTURES = "import run_page; run_page.shorten_pictures()"  # imports guiderail
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
@@ -24,15 +23,21 @@ def code_of(cell):
     return "".join(line for line in cell["source"] if not line.startswith("%"))
 
 
+@pytest.fixture(scope="module")
+def forks():
+    """Yield a server without modules of guiderail, which would hide a missing import."""
+    server = Forks(sys.executable)
+    yield server
+    server.close()
+
+
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs_in_a_new_interpreter(notebook, tmp_path):
+def test_notebook_runs_without_modules_of_the_tests(notebook, forks, tmp_path):
     program = tmp_path / "cells.py"
     shutil.copy(Path(__file__).with_name("run_page.py"), tmp_path)  # the program imports it from its own folder
     first, *cells = filter(None, (code_of(cell) for cell in code_cells(notebook)))
     program.write_text("\n".join([first, SHORTEN_PICTURES, *cells]))
-    # Not in a fork: modules that the tests have imported would hide a missing import.
-    environment = {**os.environ, "MPLBACKEND": "agg", "OMP_NUM_THREADS": "1"}
-    finished = subprocess.run([sys.executable, program], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    finished = forks.run(program, folder=tmp_path, MPLBACKEND="agg", OMP_NUM_THREADS="1")
     assert finished.returncode == 0, finished.stderr
 
 

@@ -109,11 +109,7 @@ def _set_parameter(context: Context, index: int, default: np.ndarray, rng: np.ra
 
 
 def _fix(
-    system: LeafSystem,
-    port: InputPort,
-    context: Context,
-    rng: np.random.Generator,
-    samplers: Mapping[str, Sampler],
+    system: LeafSystem, port: InputPort, context: Context, rng: np.random.Generator, samplers: Mapping[str, Sampler]
 ) -> None:
     if port.get_data_type() == PortDataType.kVectorValued:
         sample = samplers.get(port.get_name(), lambda rng, size: rng.uniform(-0.3, 0.3, size))

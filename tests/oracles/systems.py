@@ -7,14 +7,7 @@ import re
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import (
-    CacheIndex,
-    DiscreteStateIndex,
-    InputPort,
-    OutputPort,
-    PortDataType,
-    ValueProducer,
-)
+from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, OutputPort, PortDataType, ValueProducer
 
 from guiderail.models.common.errors import InputError
 from oracles.prerequisites import changed_outputs

@@ -222,13 +222,7 @@ def test_command_is_ignored_when_its_time_stamp_is_invalid(arm, time):
     assert rig.command_timed_out == 1.0
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"posture": np.full(7, np.nan)},
-        {"posture": np.array([0.0] * 6 + [np.inf])},
-    ],
-)
+@pytest.mark.parametrize("arguments", [{"posture": np.full(7, np.nan)}, {"posture": np.array([0.0] * 6 + [np.inf])}])
 def test_constructor_refuses_arguments_out_of_range(arm, arguments):
     plant, model = arm
     with pytest.raises(InputError):

@@ -66,13 +66,7 @@ def test_lost_command_is_replaced_by_the_last_delivered_one():
     assert not np.array_equal(delivered_commands(400, loss_probability=0.3, seed=2), outputs)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"loss_probability": 1.0},
-        {"loss_probability": -0.1},
-    ],
-)
+@pytest.mark.parametrize("arguments", [{"loss_probability": 1.0}, {"loss_probability": -0.1}])
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         CommandDisturbance(**{"size": 1, "period": PERIOD} | arguments)

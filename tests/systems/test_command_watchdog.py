@@ -193,15 +193,7 @@ def test_age_is_relative_to_the_start_before_the_first_check(age, command_timed_
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        (0.0, 0.1),
-        (0.01, 0.0),
-        (np.nan, 0.1),
-        (np.inf, 0.1),
-        (0.01, np.nan),
-        (0.01, np.inf),
-    ],
+    "arguments", [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1), (np.inf, 0.1), (0.01, np.nan), (0.01, np.inf)]
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):

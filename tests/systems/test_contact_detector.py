@@ -43,10 +43,7 @@ def drop(
     builder = DiagramBuilder()
     model = "hydroelastic_with_fallback" if hydroelastic else "point"
     config = MultibodyPlantConfig(
-        time_step=STEP,
-        contact_model=model,
-        discrete_contact_approximation="lagged",
-        use_sampled_output_ports=sampled,
+        time_step=STEP, contact_model=model, discrete_contact_approximation="lagged", use_sampled_output_ports=sampled
     )
     plant, _ = AddMultibodyPlant(config, builder)
     ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(mass, RADIUS))

@@ -71,12 +71,7 @@ def test_reset_restores_the_initial_opening(is_initialized):
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        {"opening": np.array([0.05, 0.0])},
-        {"opening": np.array([np.nan, 0.0])},
-        {"period": 0.0},
-    ],
+    "arguments", [{"opening": np.array([0.05, 0.0])}, {"opening": np.array([np.nan, 0.0])}, {"period": 0.0}]
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
     valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | arguments

@@ -85,13 +85,7 @@ def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        {"period": 0.0},
-        {"time_constant": -1.0},
-        {"time_constant": np.inf},
-        {"damping": -1.0},
-        {"damping": np.inf},
-    ],
+    [{"period": 0.0}, {"time_constant": -1.0}, {"time_constant": np.inf}, {"damping": -1.0}, {"damping": np.inf}],
 )
 def test_constructor_refuses_arguments_out_of_range(arm, arguments):
     with pytest.raises(InputError):

@@ -280,12 +280,7 @@ def test_violation_is_finite_without_constraints():
 
 @pytest.mark.parametrize(
     ("gain", "period", "words"),
-    [
-        (np.ones(3), PERIOD, "gain"),
-        ([np.nan, 1], PERIOD, "gain"),
-        ([np.inf, 1], PERIOD, "gain"),
-        (None, 0.0, "period"),
-    ],
+    [(np.ones(3), PERIOD, "gain"), ([np.nan, 1], PERIOD, "gain"), ([np.inf, 1], PERIOD, "gain"), (None, 0.0, "period")],
 )
 def test_constructor_refuses_arguments_out_of_range(gain, period, words):
     with pytest.raises(InputError, match=words):

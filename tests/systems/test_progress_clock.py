@@ -3,12 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import (
-    RigidTransform,
-    axis_angle_rotation,
-    pose_to_transform,
-    transform_to_pose,
-)
+from guiderail.models.common.transforms import RigidTransform, axis_angle_rotation, pose_to_transform, transform_to_pose
 from guiderail.models.laws.primitive import StateProgress
 from guiderail.systems.movement_primitive import ProgressClock
 

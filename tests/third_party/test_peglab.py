@@ -10,9 +10,11 @@ import venv
 from pathlib import Path
 
 import pytest
+from fork_server import Forks
 
 PACKAGE = Path(__file__).parent / "peglab"
 MAX_LINES = 180
+PRELOADED = [f"guiderail.tools.{name}" for name in ("cli.main", "learning.train", "evaluation.evaluate", "catalog")]
 
 
 @pytest.fixture(scope="module")
@@ -33,23 +35,16 @@ def lab(tmp_path_factory):
 
     variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
     variables.pop("PYTHONPATH", None)
-    server = subprocess.Popen(
-        [str(environment / "bin" / "python"), str(Path(__file__).parents[1] / "fork_server.py")],
-        cwd=folder, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert server.stdout.readline() == "ready\n"
+    server = Forks(str(environment / "bin" / "python"), PRELOADED, env=variables)
 
     def run(*arguments, code=0):
-        server.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder), "environment": {}}) + "\n")
-        server.stdin.flush()
-        result = json.loads(server.stdout.readline())
-        assert result["returncode"] == code, result["stdout"] + result["stderr"]
-        return result["stdout"] if code == 0 else result["stderr"]
+        result = server.run(*arguments, folder=folder)
+        assert result.returncode == code, result.stdout + result.stderr
+        return result.stdout if code == 0 else result.stderr
 
     run.folder = folder
     yield run
-    server.stdin.close()
-    server.wait()
+    server.close()
 
 
 def guiderail(lab, *arguments, code=0):

@@ -5,9 +5,8 @@ import numpy as np
 import point_env
 import pytest
 from gymnasium import spaces
-from point_env import PointEnv
+from point_env import PointEnv, guided
 
-from guiderail import GuidedEnv
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
@@ -70,12 +69,6 @@ class Faulty(PointEnv):
 
     def step(self, action):
         return self._result("step", super().step(action))
-
-
-def guided(env, **more):
-    keywords = {"pose": point_env.pose, "to_action": point_env.to_action, "period": point_env.PERIOD}
-    frame = lambda env, observation: env.unwrapped.target  # noqa: E731
-    return GuidedEnv(env, demonstrations=point_env.demonstrations(), frame=frame, **keywords | more)
 
 
 FAULTS = [("step", name) for name in STEPS] + [("reset", name) for name in RESETS]

@@ -213,10 +213,7 @@ def test_observation_that_is_not_finite_is_refused(number):
         builder.Connect(station.get_pose_output_port(), broken.get_input_port())
         return {"broken": broken.get_output_port()}
 
-    declare(
-        signals=signals,
-        observe=returning((ObservationTerm("phase"), ObservationTerm("broken", entries=(1,)))),
-    )
+    declare(signals=signals, observe=returning((ObservationTerm("phase"), ObservationTerm("broken", entries=(1,)))))
     with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
 

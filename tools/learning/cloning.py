@@ -33,10 +33,9 @@ class BcLearner(Learner):
         config: BcConfig,
         env: gymnasium.Env,
         *,
-        action_repeat: int,
         seed: int,
-        max_transitions: int,
         symmetry: Symmetry | None = None,
+        **unused: Any,
     ):
         """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config, self._space, self._seed = config, env.action_space, seed

@@ -15,7 +15,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from torch.nn.utils import parameters_to_vector
 
-from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import module_arrays, random_state, restore_modules, restore_random
@@ -40,20 +39,8 @@ class OnPolicyLearner(Learner):
     algorithm: ClassVar[type]
     own_settings: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(
-        self,
-        config: OnPolicyConfig,
-        env: gymnasium.Env,
-        *,
-        action_repeat: int,
-        seed: int,
-        max_transitions: int,
-        symmetry: Symmetry | None = None,
-    ):
-        """Construct the learner; `Learner` describes the arguments.
-
-        Only the spaces of `env` are used; `max_transitions` and the task's `symmetry` have no effect.
-        """
+    def __init__(self, config: OnPolicyConfig, env: gymnasium.Env, *, action_repeat: int, seed: int, **unused: Any):
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config = config
         algorithm: Any = self.algorithm
         self.model = algorithm(

@@ -57,7 +57,7 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     result = calibrate(RUN, recorded / "recordings", **arguments)
     (row,) = result["parameters"]
     assert row["identifiable"] == "yes"
-    # Whether 90 % of the intervals cover needs many robots (`python -m research.calibration`); this is one, with 40 draws.
+    # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 40 draws.
     assert row["low"] > 1.0  # the robot is stiffer than the nominal one
     assert np.sqrt(row["low"] * row["high"]) == pytest.approx(1.7, rel=0.2)
     assert row["high"] / row["low"] < 0.5 * row["prior_high"] / row["prior_low"]

@@ -362,10 +362,7 @@ FREE = [None] * 6  # no bound on any output
             {"motion": {"travel": 0.02, "first_contact": 0.0005}},
             r"motion\.first_contact must be more than 0\.0005, not 0\.0005",
         ),
-        (
-            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -1.0}},
-            r"push must be at least 0, not -1\.0",
-        ),
+        ({"motion": {"travel": 0.02, "first_contact": 0.01, "push": -1.0}}, r"push must be at least 0, not -1\.0"),
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "friction": 3}])}, r"plug\.pieces\[0\]\.friction must be"),
         ({"motion": {"travel": 0.02}}, r"motion\.first_contact is missing: give it"),
         (

@@ -2,6 +2,7 @@
 
 import pytest
 
+from guiderail.diagrams.tasks import contact_probe
 from guiderail.models.common.errors import InputError
 from guiderail_studies import converge as converge_module
 from guiderail_studies.converge import coarsest_step, conditions, converge, parse_steps
@@ -65,6 +66,7 @@ def test_conditions_raise_for_a_step_that_does_not_divide_the_control_period():
 
 def test_converge_evaluates_each_step_once(tmp_path, capsys, monkeypatch):
     options = {"steps": (10.0, 5.0), "episodes": 1, "out": tmp_path, "environment": {"station": "gantry"}}
+    monkeypatch.setattr(contact_probe, "capture_offset", lambda *_, **options: 0.0)  # takes most of the time
     first = converge("pretrained:connector", processes=1, **options)
     assert [row["step_ms"] for row in first["rows"]] == [10.0, 5.0]
     assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])

@@ -17,15 +17,7 @@ from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.subject import Subject
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.trainer import run_training
-from guiderail_studies.robustness import (
-    AXES,
-    Axis,
-    draw,
-    points,
-    robustness,
-    select_axes,
-    values_below,
-)
+from guiderail_studies.robustness import AXES, Axis, draw, points, robustness, select_axes, values_below
 
 WALL = Axis("wall", "wall [m]", (-0.5, 1.0), 1.0, lambda environment, value: {"wall": value})
 

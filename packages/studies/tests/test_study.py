@@ -474,10 +474,7 @@ INVALID = [
     ({"after_episodes": [0]}, "greater than or equal to 1"),
     ({"after_episodes": [True]}, "input should be a valid integer, not True"),
     ({"after_episodes": [5], "learner": {"episodes": 1}}, "no method trains for 5 episodes"),
-    (
-        {"after_episodes": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}},
-        "no method trains for 5 episodes",
-    ),
+    ({"after_episodes": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}}, "no method trains for 5 episodes"),
     ({"task": "NarrowPassage", "eval_set": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
     ({"task": "NarrowPassage", "eval_set": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
     ({"after_episodes": [], "learner": {}}, "learner needs a number of training episodes"),

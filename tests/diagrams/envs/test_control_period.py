@@ -9,12 +9,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.plane import PlaneStation
-from guiderail.diagrams.stations.station import (
-    CONTROL_PERIOD,
-    PLANT_PERIOD,
-    command_timeout,
-    tare_steps,
-)
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD, command_timeout, tare_steps
 from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
 from guiderail.diagrams.tasks.task import Task

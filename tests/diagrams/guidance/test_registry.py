@@ -44,15 +44,9 @@ def test_symmetry_is_absent_when_actions_do_not_displace(size, monkeypatch):
 def test_symmetry_is_present_when_actions_displace_outputs():
     displacing = {name for name in GUIDANCE.names() if GUIDANCE.get(name).displaces}
     assert displacing == {
-        "kgrl",
-        "skgrl",
-        "residual",
-        "safe_residual",
-        "kmp",
-        "residual_covariance",
-        "residual_cbf",
+        "kgrl", "skgrl", "residual", "safe_residual", "kmp", "residual_covariance", "residual_cbf",
         "residual_tangent",
-    }
+    }  # fmt: skip
     env = make_env("BncConnector", guidance="kgrl")
     np.testing.assert_array_equal(env.diagram.symmetry.actions, [-np.eye(2)])
     assert len(env.diagram.near_symmetry.actions) > 1

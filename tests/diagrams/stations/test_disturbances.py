@@ -117,10 +117,7 @@ def test_late_commands_delay_the_tool(undisturbed):
 
 def test_lost_commands_are_independent_of_the_noise():
     env = make_env(
-        "GridClamp",
-        sensing={"wrench_noise": (0.2, 0.01)},
-        disturbances={"lost_commands": 0.3},
-        action_repeat=1,
+        "GridClamp", sensing={"wrench_noise": (0.2, 0.01)}, disturbances={"lost_commands": 0.3}, action_repeat=1
     )
     station = env.diagram.diagram.GetSubsystemByName("station")
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))

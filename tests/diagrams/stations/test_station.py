@@ -10,12 +10,7 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 
-STATIONS = [
-    ("NarrowPassage", "plane"),
-    ("Pouring", "pouring"),
-    ("BncConnector", "gantry"),
-    ("BncConnector", "arm"),
-]
+STATIONS = [("NarrowPassage", "plane"), ("Pouring", "pouring"), ("BncConnector", "gantry"), ("BncConnector", "arm")]
 
 
 @pytest.mark.parametrize(("task", "name"), STATIONS)

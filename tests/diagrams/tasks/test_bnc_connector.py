@@ -88,11 +88,15 @@ def test_torque_search_locks_when_the_offset_is_hidden(guidance, request):
     assert rows["max_commanded_violation"].max() <= 1e-9
 
 
+@pytest.fixture(scope="module")
+def safe_residual():
+    return make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
+
+
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
-def test_commands_satisfy_the_constraint_under_any_action(guidance, kgrl, skgrl):
+def test_commands_satisfy_the_constraint_under_any_action(guidance, request):
     """Random corners of the square of actions, which change at every step."""
-    safe_residual = make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
-    env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
+    env = request.getfixturevalue(guidance)
     rng = np.random.default_rng(3)
     info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9

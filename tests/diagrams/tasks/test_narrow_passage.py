@@ -190,13 +190,19 @@ def test_shaped_reward_adds_progress_towards_the_goal():
     assert progress == pytest.approx(100 * (start - WORLD.goal_radius), abs=1.0)
 
 
+@pytest.fixture(scope="module")
+def measuring():
+    """Return an environment whose history is the measured pose."""
+    return make("skgrl", history={"length": 1, "source": "measured"})
+
+
 @pytest.mark.parametrize("step", [10, 20, 45])
 @pytest.mark.parametrize("push", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.03)])
-def test_command_continues_at_the_pushed_pose(step, push):
+def test_command_continues_at_the_pushed_pose(step, push, measuring):
     """Section 5.3.4: with P = 1 the history is the measured pose, so the command continues at the robot."""
     if step == 45 and push[1] == 0.0:
         push = (0.01 * np.sign(push[0]), 0.0)  # free space to the walls [m]
-    env = make("skgrl", history={"length": 1, "source": "measured"})
+    env = measuring
     env.reset()
     info = {"termination": ""}
     worst_after = -np.inf

@@ -36,11 +36,7 @@ class SimulatedRun:
     def __init__(self, driver: type[FciDriver] = FciDriver):
         self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
         self.station = HardwareStation(
-            BncWorkcell(),
-            driver(self.host),
-            Impedance().with_max_force(FORCE_LIMIT),
-            robot="panda",
-            robot_timeout=60.0,
+            BncWorkcell(), driver(self.host), Impedance().with_max_force(FORCE_LIMIT), robot="panda", robot_timeout=60.0
         )
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()

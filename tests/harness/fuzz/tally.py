@@ -4,6 +4,7 @@ import faulthandler
 import resource
 import signal
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 
 MAX_SECONDS = 2.0  # largest CPU time of an input [s]
@@ -30,33 +31,23 @@ def attempt(target: str, refusal: type[Exception], call):
         call: Function that reads the input.
     """
     COUNTS[target, "inputs"] += 1
+    outcome = "tracebacks"
     try:
-        with _Limits(target) if measuring else _NoLimits():
+        with _Limits(target) if measuring else nullcontext():
             result = call()
-    except refusal as error:
-        message = str(error)
-    except TooSlowError:
-        COUNTS[target, "hangs"] += 1
-        raise
-    except Exception:
-        COUNTS[target, "tracebacks"] += 1
-        raise
-    else:
-        COUNTS[target, "accepted"] += 1
+        outcome = "accepted"
         return result
-    COUNTS[target, "refused"] += 1
+    except refusal as error:
+        outcome, message = "refused", str(error)
+    except TooSlowError:
+        outcome = "hangs"
+        raise
+    finally:
+        COUNTS[target, outcome] += 1
     # The message is printed as one sentence.
     assert "\n" not in message
     assert 0 < len(message) < 1000
     return None
-
-
-class _NoLimits:
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        return None
 
 
 class _Limits:

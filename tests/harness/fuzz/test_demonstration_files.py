@@ -45,19 +45,19 @@ def demonstrations(draw):
     return Demonstrations(times, values, names)
 
 
-def check_equal(loaded: Demonstrations, parts) -> None:
-    """Check that demonstrations equal the given pairs of times and outputs."""
+def assert_equal(loaded: Demonstrations, parts) -> None:
+    """Assert that demonstrations equal the given pairs of times and outputs."""
     assert loaded.num_demonstrations == len(parts)
     for t, y, (expected_t, expected_y) in zip(loaded.times, loaded.outputs, parts, strict=True):
         np.testing.assert_array_equal(t, expected_t)
         np.testing.assert_array_equal(y, expected_y)
 
 
-def check_exact_or_refused(target: str, path: Path, read) -> None:
-    """Check that a file is refused, or loaded with the values that the independent reader `read` finds."""
+def assert_exact_or_refused(target: str, path: Path, read) -> None:
+    """Assert that a file is refused, or loaded with the values that the independent reader `read` finds."""
     loaded = attempt(target, InputError, lambda: Demonstrations.load(path))
     if loaded is not None:
-        check_equal(loaded, read(path))
+        assert_equal(loaded, read(path))
 
 
 @pytest.mark.parametrize("ending", ["npz", "csv"])
@@ -67,7 +67,7 @@ def test_demonstrations_round_trip_is_bit_exact(folder, ending, saved):
     saved.save(path)
     loaded = attempt(f"{ending}, round trip", (), lambda: Demonstrations.load(path))
     assert loaded.names == saved.names
-    check_equal(loaded, list(zip(saved.times, saved.outputs, strict=True)))
+    assert_equal(loaded, list(zip(saved.times, saved.outputs, strict=True)))
     for a, b in zip(loaded.outputs, saved.outputs, strict=True):
         np.testing.assert_array_equal(np.signbit(a), np.signbit(b))
 
@@ -109,7 +109,7 @@ def members(draw):
 def test_npz_with_any_arrays_is_exact_or_refused(folder, arrays, compressed):
     path = folder / "arrays.npz"
     (np.savez_compressed if compressed else np.savez)(path, **arrays)
-    check_exact_or_refused("npz, arrays", path, npz_demonstrations)
+    assert_exact_or_refused("npz, arrays", path, npz_demonstrations)
 
 
 def archive(compression) -> bytes:
@@ -129,7 +129,7 @@ def test_npz_with_changed_bytes_is_exact_or_refused(folder, data, changes, flips
     """Most of these files have a wrong checksum and are refused."""
     path = folder / "bytes.npz"
     path.write_bytes(flipped(edited(data, changes) if len(flips) % 2 else data, flips))
-    check_exact_or_refused("npz, bytes changed", path, npz_demonstrations)
+    assert_exact_or_refused("npz, bytes changed", path, npz_demonstrations)
 
 
 @given(st.data())
@@ -142,7 +142,7 @@ def test_npz_with_changed_members_is_exact_or_refused(folder, data):
     with zipfile.ZipFile(path, "w") as file:
         for name, content in members.items():
             file.writestr(name, content)
-    check_exact_or_refused("npz, members changed", path, npz_demonstrations)
+    assert_exact_or_refused("npz, members changed", path, npz_demonstrations)
 
 
 DTYPES = st.sampled_from(["<f8", "<f4", "|b1", "<U2", "|O", "<f99", "f8", "=f8", "<i8", "V8", "", "<m8", "<f8,<f8"])
@@ -169,7 +169,7 @@ def test_npz_with_any_header_is_exact_or_refused(folder, kind, shape, fortran_or
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("times.npy", t.getvalue())
         file.writestr("outputs.npy", b"\x93NUMPY" + bytes([version, 0]) + size + header + content[:length])
-    check_exact_or_refused("npz, headers", path, npz_demonstrations)
+    assert_exact_or_refused("npz, headers", path, npz_demonstrations)
 
 
 FIELDS = st.sampled_from(
@@ -178,18 +178,10 @@ FIELDS = st.sampled_from(
 )
 FIRST_LINES = st.sampled_from(
     [
-        "t,x",
-        "t,x,y",
-        "time [s],x",
-        "demonstration,time,x",
-        "demonstration,time,x,y",
-        "",
-        "x,y",
-        '"t","x"',
-        "t;x",
+        "t,x", "t,x,y", "time [s],x", "demonstration,time,x", "demonstration,time,x,y", "", "x,y", '"t","x"', "t;x",
         "T,x,",
     ]
-)
+)  # fmt: skip
 NUMBERS = st.sampled_from(["0", "1", "-2.5", "1e-3", " 7"])
 
 
@@ -202,7 +194,7 @@ def test_csv_with_any_fields_is_exact_or_refused(folder, first, rows, end):
     rows = [[str(number), *row] for number, row in enumerate(rows)]
     path = folder / "fields.csv"
     path.write_text(end.join([first, *(",".join(row) for row in rows), ""]), encoding="utf-8", newline="")
-    check_exact_or_refused("csv, odd fields", path, csv_demonstrations)
+    assert_exact_or_refused("csv, odd fields", path, csv_demonstrations)
 
 
 @given(
@@ -217,7 +209,7 @@ def test_csv_with_few_changed_fields_is_exact_or_refused(folder, first, length, 
         rows[row % length][column % width] = field
     path = folder / "few.csv"
     path.write_text("\n".join([first, *map(",".join, rows)]), encoding="utf-8", newline="")
-    check_exact_or_refused("csv, a few odd fields", path, csv_demonstrations)
+    assert_exact_or_refused("csv, a few odd fields", path, csv_demonstrations)
 
 
 TABLE = b"demonstration,time,x [m],y\n" + b"".join(b"%d,%d,%d.5,-1e-%d\n" % (n // 5, n % 5, n, n) for n in range(10))
@@ -227,7 +219,7 @@ TABLE = b"demonstration,time,x [m],y\n" + b"".join(b"%d,%d,%d.5,-1e-%d\n" % (n /
 def test_csv_with_changed_bytes_is_exact_or_refused(folder, changes):
     path = folder / "bytes.csv"
     path.write_bytes(edited(TABLE, changes))
-    check_exact_or_refused("csv, bytes changed", path, csv_demonstrations)
+    assert_exact_or_refused("csv, bytes changed", path, csv_demonstrations)
 
 
 SCALARS = (

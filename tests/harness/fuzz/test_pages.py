@@ -74,7 +74,7 @@ def expected_inputs(messages, slider, gamepad):
                 are_valid = all(type(value) in (int, float) and math.isfinite(value) for value in values)
                 if type(index) is int and 0 <= index < 64 and are_valid:
                     gamepad = [max(-1.0, min(1.0, float(value))) for value in event["gamepad"]["axes"]]
-        except Exception:  # the page ignores malformed messages, which raise exceptions of many types
+        except (ValueError, TypeError, KeyError, msgpack.UnpackException):  # the page ignores malformed messages
             continue
     return clicks, slider, gamepad
 

@@ -4,15 +4,14 @@ import csv
 import io
 import json
 
-import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import load_file
+from spaces_only_env import SpacesOnlyEnv
 
 from fuzz.changes import bit_flips, changed_texts, changed_trees, edited, edits, flipped
 from fuzz.tally import attempt
@@ -61,8 +60,8 @@ def read(folder):
     return config
 
 
-def try_config(target, folder, text):
-    """Check that a text of config.yaml is refused, or read with the values that PyYAML finds."""
+def assert_config_is_exact_or_refused(target, folder, text):
+    """Assert that a text of config.yaml is refused, or read with the values that PyYAML finds."""
     (folder.path / "config.yaml").write_text(text, encoding="utf-8", newline="")
     config = attempt(target, InputError, lambda: read(folder))
     if config is None:
@@ -94,13 +93,15 @@ def test_config_with_changed_entries_is_exact_or_refused(folder, texts, data):
     # Imported modules are executed, so a changed import can raise any exception.
     if isinstance(tree, dict):
         tree.pop("imports", None)
-    try_config("config.yaml, entries changed", folder, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+    assert_config_is_exact_or_refused(
+        "config.yaml, entries changed", folder, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
+    )
 
 
 @given(st.data())
 def test_config_with_changed_characters_is_exact_or_refused(folder, texts, data):
     text = data.draw(changed_texts([text.replace("imports: []\n", "") for text in texts]))
-    try_config("config.yaml, characters changed", folder, text)
+    assert_config_is_exact_or_refused("config.yaml, characters changed", folder, text)
 
 
 ROW = {"episode": 0, "return": -1.25, "success": 1, "termination": "success", "steps": 40, "peak_force": 1.5}
@@ -113,8 +114,8 @@ FIELDS = st.sampled_from(
 )
 
 
-def try_table(target, folder, content):
-    """Check that the content of episodes.csv is refused, or read with the values that the csv module finds."""
+def assert_table_is_exact_or_refused(target, folder, content):
+    """Assert that the content of episodes.csv is refused, or read with the values that the csv module finds."""
     (folder.path / "episodes.csv").write_bytes(content)
     table = attempt(target, InputError, lambda: _summarized(folder))
     if table is None:
@@ -145,12 +146,12 @@ def test_episodes_with_changed_fields_are_exact_or_refused(folder, changes):
     rows = [line.split(",") for line in TABLE.decode().splitlines()]
     for row, column, field in changes:
         rows[row][column] = field
-    try_table("episodes.csv, odd fields", folder, "\n".join(map(",".join, rows)).encode())
+    assert_table_is_exact_or_refused("episodes.csv, odd fields", folder, "\n".join(map(",".join, rows)).encode())
 
 
 @given(edits(3))
 def test_episodes_with_changed_bytes_are_exact_or_refused(folder, changes):
-    try_table("episodes.csv, bytes changed", folder, edited(TABLE, changes))
+    assert_table_is_exact_or_refused("episodes.csv, bytes changed", folder, edited(TABLE, changes))
 
 
 ARRAYS = {"weights": np.linspace(-1, 1, 6, dtype=np.float32).reshape(2, 3), "count": np.arange(3), "none": np.zeros(0)}
@@ -178,8 +179,8 @@ DESCRIPTION |= {"observation_shape": [3]}
 OBSERVATION = np.array([0.5, -1.0, 2.0])
 
 
-def try_policy(target, folder, expected):
-    """Check that a policy is refused, or acts within its limits and with the expected action unless it is None."""
+def assert_policy_is_bounded_or_refused(target, folder, expected):
+    """Assert that a policy is refused, or acts within its limits and with the expected action unless it is None."""
     policy = attempt(target, InputError, lambda: Policy.load(folder.path))
     if policy is None:
         return
@@ -197,7 +198,7 @@ def test_policy_with_changed_bytes_is_exact_or_refused(folder, file, changes, fl
     policy.save(folder.path)
     path = folder.path / file
     path.write_bytes(flipped(edited(path.read_bytes(), [] if flips else changes), flips))
-    try_policy("policy, bytes changed", folder, policy(OBSERVATION))
+    assert_policy_is_bounded_or_refused("policy, bytes changed", folder, policy(OBSERVATION))
 
 
 @given(st.data())
@@ -209,7 +210,7 @@ def test_policy_with_changed_entries_is_bounded_or_refused(folder, data):
     if isinstance(tree, dict):
         tree["digest"] = _digest(load_file(folder.path / "policy.safetensors"), tree)
     (folder.path / "policy.json").write_text(json.dumps(tree))
-    try_policy("policy, entries changed", folder, None)
+    assert_policy_is_bounded_or_refused("policy, entries changed", folder, None)
 
 
 @pytest.fixture(scope="module")
@@ -236,13 +237,6 @@ def restored(folder, learner, env):
     loop = TrainingLoop(folder, learner, Episodes(CONFIGS[0], env))
     loop.restore()
     return loop
-
-
-class SpacesOnlyEnv(gymnasium.Env):
-    """Environment without dynamics, with spaces and a random generator."""
-
-    observation_space = spaces.Box(-1, 1, (3,), np.float32)
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
 
 
 @given(st.data())

@@ -59,8 +59,8 @@ states:
 TREES = [yaml.safe_load(text) for text in TEXTS]
 
 
-def check_numbers(template, text):
-    """Check that every number equals the number that an independent reader finds at the same place in the file."""
+def assert_numbers(template, text):
+    """Assert that every number equals the number that an independent reader finds at the same place in the file."""
     result = template_numbers(text)
     data = parse_yaml(text)
     for name, value in template.parameters.items():
@@ -85,38 +85,38 @@ def check_numbers(template, text):
             parts = getattr(state, field)
             assert len(parts) == len(entry[field])
             for number, part in enumerate(parts):
-                check_fields(part, entry[field][number], (*place, field, str(number)), result)
-        check_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), result)
+                assert_fields(part, entry[field][number], (*place, field, str(number)), result)
+        assert_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), result)
 
 
 def _scaled(si, value):
     return None if value is None else si * value
 
 
-def check_fields(part, entry, place, found):
-    """Check the fields of a part of a template against its entry in the file and the numbers `found` by the reader."""
+def assert_fields(part, entry, place, found):
+    """Assert the fields of a part of a template against its entry in the file and the numbers `found` by the reader."""
     assert set(entry) - {"kind"} <= {field.name for field in dataclasses.fields(part)}
     for key, value in entry.items():
         if key == "of":
-            check_fields(part.of, value, (*place, "of"), found)
+            assert_fields(part.of, value, (*place, "of"), found)
         elif key != "kind":
-            check_value(getattr(part, key), value, (*place, key), found)
+            assert_value(getattr(part, key), value, (*place, key), found)
 
 
-def check_value(value, entry, place, found):
-    """Check a value against its entry in the file; numbers against those `found` by the independent reader."""
+def assert_value(value, entry, place, found):
+    """Assert a value against its entry in the file; numbers against those `found` by the independent reader."""
     if isinstance(value, tuple):
         assert len(value) == len(entry)
         for number, (inner, inner_entry) in enumerate(zip(value, entry, strict=True)):
-            check_value(inner, inner_entry, (*place, str(number)), found)
+            assert_value(inner, inner_entry, (*place, str(number)), found)
     elif isinstance(value, str | bool):
         assert value is entry or value == entry
     else:
         assert value == found[place]
 
 
-def check_laws(template):
-    """Check that all laws of all states return finite values, at a pose near the object and at a distant pose."""
+def assert_laws_are_finite(template):
+    """Assert that all laws of all states return finite values, at a pose near the object and at a distant pose."""
     X_WF = {
         name: RigidTransform(RotationMatrix.MakeZRotation(0.3 + i), [0.5, 0.1 * i, 0.1])
         for i, name in enumerate(template.frames)
@@ -136,22 +136,24 @@ def check_laws(template):
             assert isinstance(template.states[number].transition_distance, TransitionDistance)
 
 
-def try_template(target, text):
+def assert_template_is_exact_or_refused(target, text):
     template = attempt(target, InputError, lambda: parse_template(text))
     if template is not None:
-        check_numbers(template, text)
-        check_laws(template)
+        assert_numbers(template, text)
+        assert_laws_are_finite(template)
 
 
 @given(changed_trees(TREES))
 @example(TREES[-1])
 def test_template_with_changed_entries_is_exact_or_refused(tree):
-    try_template("template, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+    assert_template_is_exact_or_refused(
+        "template, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
+    )
 
 
 @given(changed_texts(TEXTS))
 def test_template_with_changed_characters_is_exact_or_refused(text):
-    try_template("template, characters changed", text)
+    assert_template_is_exact_or_refused("template, characters changed", text)
 
 
 TOKENS = st.sampled_from(
@@ -163,7 +165,7 @@ TOKENS = st.sampled_from(
 def test_arithmetic_is_exact_or_refused(expression):
     tree = copy.deepcopy(TREES[-1])
     tree["max_speed_m_per_s"] = expression
-    try_template("template, arithmetic", yaml.safe_dump(tree, sort_keys=False))
+    assert_template_is_exact_or_refused("template, arithmetic", yaml.safe_dump(tree, sort_keys=False))
 
 
 # PyYAML writes the text "1e3" without quotes, which is a number in YAML 1.2.

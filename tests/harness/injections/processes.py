@@ -87,14 +87,19 @@ class Listener:
             self.lcm.HandleSubscriptions(max(1, int(1000 * remaining)))
 
     def wait_for_motion(self, seconds: float, rate: float) -> bool:
-        """Wait for 0.7 s of motion (robot's clock) without a stop; return False after `seconds` of wall clock time."""
+        """Wait for 0.7 s of motion (robot's clock) without a stop while both safety monitors are running.
+
+        Returns:
+            False after `seconds` of wall clock time.
+        """
         end = time.monotonic() + seconds
+        self.is_stopping.clear()
         since = None
         while time.monotonic() < end:
             self.listen(0.01)
             if self.is_stopped_by_monitor:
                 since = None
-            elif self.speed > MOVING:
+            elif self.speed > MOVING and len(self.is_stopping) > 1:
                 since = since or time.monotonic()
             if since is not None and time.monotonic() - since > 0.7 / rate:
                 return True

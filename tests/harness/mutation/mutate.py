@@ -95,13 +95,8 @@ SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
 # Modules without mutants whose import is slow: imported before a process is forked for each mutant.
 SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "pydrake.math", "pytest")
 SLOW_IMPORTS += (
-    "scipy.optimize",
-    "scipy.sparse",
-    "scipy.spatial.transform",
-    "sklearn.mixture",
-    "yaml",
-    "matplotlib.figure",
-)
+    "scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure",
+)  # fmt: skip
 SLOW_IMPORTS += (
     "pydrake.multibody.plant",
     "pydrake.systems.analysis",

@@ -20,10 +20,7 @@ REGISTRIES = {
     "task": TASKS, "station": STATIONS, "guidance": GUIDANCE, "kernel": KERNELS, "robot": ROBOTS,
     "end_effector": END_EFFECTORS, "learner": LEARNERS,
 }  # fmt: skip
-OPTIONS = {
-    "station_options": (STATIONS, "options"),
-    "learner_config": (LEARNERS, "Config"),
-}
+OPTIONS = {"station_options": (STATIONS, "options"), "learner_config": (LEARNERS, "Config")}
 
 
 @pytest.mark.parametrize("name", [{}, [], None, 3, ["sphere"]])

@@ -3,11 +3,7 @@ import pytest
 from motion_adversary import KINDS, attack, is_violated
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.motion_constraints import (
-    MotionConstraintFilter,
-    MotionConstraints,
-    MotionLimits,
-)
+from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints, MotionLimits
 from guiderail.models.control.shapes import Box, Sphere
 from guiderail.models.primitives import LinearConstraints
 from oracles.franka import FRANKA_LIMITS

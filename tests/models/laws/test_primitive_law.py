@@ -9,12 +9,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws import PrimitiveLaw, Stepper
-from guiderail.models.primitives import (
-    LcNsKmp,
-    LinearConstraints,
-    ReferenceTrajectory,
-    UnsolvableError,
-)
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.systems.movement_primitive import HistoryBuffer, LcNsKmpSystem
 
 PERIOD, STEPS = 0.02, 40

@@ -228,13 +228,7 @@ def test_box_rows_are_ordered_by_output_lower_bound_first():
 
 
 @pytest.mark.parametrize(
-    ("lower", "upper"),
-    [
-        ([np.nan], [1.0]),
-        ([0.0], [np.nan]),
-        ([[0.0], [-np.inf]], [[1.0], [1.0]]),
-        ([1.0], [0.0]),
-    ],
+    ("lower", "upper"), [([np.nan], [1.0]), ([0.0], [np.nan]), ([[0.0], [-np.inf]], [[1.0], [1.0]]), ([1.0], [0.0])]
 )
 def test_box_refuses_invalid_bounds(lower, upper):
     with pytest.raises(InputError):

@@ -102,11 +102,7 @@ def test_robot_refuses_invalid_data(fields, reason):
 
 
 @pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"opening": {}}, "opening"),
-        ({"opening": {"left_finger_joint": np.inf}}, "opening"),
-    ],
+    ("fields", "reason"), [({"opening": {}}, "opening"), ({"opening": {"left_finger_joint": np.inf}}, "opening")]
 )
 def test_end_effector_refuses_invalid_data(fields, reason):
     with pytest.raises(InputError, match=reason):

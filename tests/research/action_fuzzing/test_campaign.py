@@ -126,8 +126,7 @@ def tilted_env(*steps, state=0):
 
 
 @pytest.mark.parametrize(
-    ("env", "tilt"),
-    [(tilted_env(), 0.0), (tilted_env(3), 0.3), (tilted_env(9), 0.3), (tilted_env(3, state=1), 0.0)],
+    ("env", "tilt"), [(tilted_env(), 0.0), (tilted_env(3), 0.3), (tilted_env(9), 0.3), (tilted_env(3, state=1), 0.0)]
 )
 def test_early_tilt_covers_every_control_step(env, tilt):
     callback = EarlyTilt(env)

@@ -89,8 +89,7 @@ def test_shielded_template_never_spills_in_training():
 
 
 @pytest.mark.parametrize(
-    ("success", "expected"),
-    [([1] * 10, 0), ([0, 0] + [1] * 12, 2), ([1] * 9 + [0] + [1] * 9, None), ([], None)],
+    ("success", "expected"), [([1] * 10, 0), ([0, 0] + [1] * 12, 2), ([1] * 9 + [0] + [1] * 9, None), ([], None)]
 )
 def test_convergence_begins_with_ten_successes(success, expected):
     assert converged_at(pd.Series(success, dtype=float)) == expected

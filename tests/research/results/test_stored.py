@@ -34,10 +34,7 @@ def test_baselines_succeed_at_standard_tasks():
 
 @pytest.mark.parametrize(
     ("study", "baseline", "episodes"),
-    [
-        ("connector_hard_baselines", "demonstration", 200),
-        ("pouring_hard_shield", "zero", 100),
-    ],
+    [("connector_hard_baselines", "demonstration", 200), ("pouring_hard_shield", "zero", 100)],
 )
 def test_baselines_fail_and_scripted_succeeds_when_hard(study, baseline, episodes):
     for method, largest in ((baseline, 0.05), ("uniform_random", 0.10), ("best_constant", 0.15)):

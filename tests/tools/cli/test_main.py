@@ -270,24 +270,10 @@ for line in ("--version", "--help", "study --help", "evaluate --help", "list tas
 @pytest.mark.parametrize(
     "text",
     [
-        "0",
-        "-7",
-        "007",
-        "1.50",
-        "-0.0",
-        "word",
-        "nan",
-        "inf",
-        "true",
-        "null",
-        "no",
-        "a-b",
-        "1e-3",
-        "1_0",
-        "1_0.5",
+        "0", "-7", "007", "1.50", "-0.0", "word", "nan", "inf", "true", "null", "no", "a-b", "1e-3", "1_0", "1_0.5",
         "\u0661",
     ],
-)
+)  # fmt: skip
 def test_as_value_reads_plain_text_as_yaml_does(text):
     (expected,) = as_value(f"[{text}]")
     assert repr(as_value(text)) == repr(expected)

@@ -9,14 +9,7 @@ from typer.main import get_command
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.app import print_result
 from guiderail.tools.cli.main import load_commands, main
-
-
-def call(capsys, *arguments):
-    """Run a command; return its exit code, standard output and standard error."""
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return end.value.code, out, err
+from oracles.commands import call
 
 
 def options_of(kind):

@@ -1,16 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector import (
-    GAIN,
-    NUM_STEPS,
-    PRESSING,
-    SCALED_RIM,
-    TIME,
-    TORQUE_X,
-    TORQUE_Y,
-    Z,
-)
+from guiderail.diagrams.tasks.bnc_connector import GAIN, NUM_STEPS, PRESSING, SCALED_RIM, TIME, TORQUE_X, TORQUE_Y, Z
 from guiderail.diagrams.tasks.grid_clamp import scripted_gentle_search, scripted_search, straight_descent
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError

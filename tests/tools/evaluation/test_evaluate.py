@@ -11,11 +11,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
-from guiderail.tools.evaluation.evaluate import (
-    _save_demonstrations,
-    evaluate,
-    evaluate_policy,
-)
+from guiderail.tools.evaluation.evaluate import _save_demonstrations, evaluate, evaluate_policy
 from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, stored_episodes
 from guiderail.tools.evaluation.subject import evaluation_scope, outcome, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder

@@ -17,12 +17,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
-from guiderail.tools.evaluation.policies import (
-    as_policy,
-    check_compatible,
-    is_policy_file,
-    load_policy,
-)
+from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.pretrained import find_run

@@ -18,7 +18,7 @@ from oracles.same_runs import differences
 
 SETTINGS = {"net_arch": "8", "gradient_steps": 1, "batch_size": 8, "learning_starts": 10}
 ENVIRONMENT = {"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40}
-VARIANTS = {"near": {}, "walled": {"wall": 0.2}, "slow": {"action_repeat": 2}}
+VARIANTS = {"near": {}, "walled": {"wall": -0.5}, "slow": {"action_repeat": 5}}
 
 
 def configuration(variants=VARIANTS, episodes=5, **settings):
@@ -69,8 +69,8 @@ def test_table_and_evaluation_name_the_environment_of_an_episode(tmp_path):
         "Bead", "skgrl", out=tmp_path / "run", variants=VARIANTS, episodes=6, seed=1, settings=SETTINGS, pictures=False
     )
     assert collections.Counter(run.episodes["environment"]) == dict.fromkeys(VARIANTS, 2)
-    assert run.config.members[1].environment["wall"] == 0.2
-    assert run.config.action_repeat == 1  # mean of 1, 1 and 2, rounded
+    assert run.config.members[1].environment["wall"] == -0.5
+    assert run.config.action_repeat == 2  # mean of 1, 1 and 5, rounded
     evaluation = guiderail.evaluate(run, episodes=2, baselines=["uniform_random"], processes=1)
     assert evaluation["episodes"] == 6
     assert set(evaluation["environments"]) == set(VARIANTS)

@@ -75,8 +75,7 @@ def assert_equal(plain, ensemble, tolerance):
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
 @pytest.mark.parametrize(
-    ("preset", "settings"),
-    [("tqc_contact", {}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
+    ("preset", "settings"), [("tqc_contact", {}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})]
 )
 def test_fast_step_equals_the_step_of_stable_baselines3(plain, ensemble, preset, settings):
     expected, result = make(plain, preset, **settings), make(ensemble, preset, **settings)

@@ -1,23 +1,15 @@
 """Training in environments of other packages: registered ids, and environments that are given as objects."""
 
 import numpy as np
-import point_env
 import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation, TimeLimit
-from point_env import PointEnv
+from point_env import PointEnv, guided
 from spaces_only_env import SpacesOnlyEnv
 
 import guiderail
-from guiderail import GuidedEnv
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-
-
-def guided(env, **more):
-    keywords = {"pose": point_env.pose, "to_action": point_env.to_action, "period": point_env.PERIOD}
-    frame = lambda env, observation: env.unwrapped.target  # noqa: E731
-    return GuidedEnv(env, demonstrations=point_env.demonstrations(), frame=frame, **keywords | more)
 
 
 @pytest.mark.parametrize("algorithm", ["tqc", "sac", "ppo"])

@@ -1,9 +1,6 @@
-import os
+import multiprocessing
 import signal
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -23,20 +20,19 @@ from guiderail.tools.learning.run_folder import RunFolder, configure, resumed_co
 from guiderail.tools.learning.train import Training, train
 from guiderail.tools.learning.trainer import Observers, run_training
 
-# Program that trains the run of `bead_config` and prints the number of each finished episode.
-CHILD = """
-import sys
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-import bead
-bead.register()
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.run_folder import configure
-from guiderail.tools.learning.trainer import Observers, run_training
-settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
-run_training(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
-      observers=Observers(lambda row: print(row["episode"], flush=True)))
-"""
+FORKS = multiprocessing.get_context("forkserver")
+
+
+def train_and_report(path, config, sender):
+    """Train a run, and send the number of each finished episode."""
+    run_training(RunFolder(path), config, observers=Observers(lambda row: sender.send(row["episode"])))
+
+
+def hold_lock(path, sender):
+    """Lock a run, and wait until the process is killed."""
+    with RunFolder(path).locked():
+        sender.send("locked")
+        signal.pause()
 
 
 def without_clock(rows):
@@ -110,16 +106,16 @@ def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_killed_run_resumes_bit_for_bit(bead_config, bead_run, tmp_path):
+def test_killed_run_resumes_bit_for_bit(bead_config, bead_run, forkserver, tmp_path):
     killed = RunFolder(tmp_path / "killed")
-    code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None
-        for line in child.stdout:
-            if int(line) == 4:
-                os.kill(child.pid, signal.SIGKILL)
-                break
-    assert child.returncode == -signal.SIGKILL
+    receiver, sender = FORKS.Pipe(duplex=False)
+    child = FORKS.Process(target=train_and_report, args=(killed.path, bead_config, sender))
+    child.start()
+    while receiver.recv() < 4:
+        pass
+    child.kill()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
     assert not (killed.path / "policy.safetensors").exists()
     run_training(killed, bead_config, resume=True)
     assert_same_run(RunFolder(bead_run), killed)
@@ -223,16 +219,16 @@ def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
     assert without_clock(rows) != without_clock(run_training(RunFolder(tmp_path / "plain"), plain))
 
 
-def test_run_is_locked_against_other_processes(bead_config, tmp_path):
+def test_run_is_locked_against_other_processes(bead_config, forkserver, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    code = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
-    code += f"with RunFolder({str(folder.path)!r}).locked(): print('locked', flush=True); sys.stdin.read()"
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        with pytest.raises(InputError, match="another process writes into"):
-            run_training(folder, bead_config)
-        process.kill()  # leaves a lock file without effect
+    receiver, sender = FORKS.Pipe(duplex=False)
+    process = FORKS.Process(target=hold_lock, args=(folder.path, sender))
+    process.start()
+    assert receiver.recv() == "locked"
+    with pytest.raises(InputError, match="another process writes into"):
+        run_training(folder, bead_config)
+    process.kill()  # leaves a lock file without effect
+    process.join()
     (folder.path / f".episodes.csv.{process.pid}.part").write_text("from a process that was killed while writing")
     with folder.locked():
         pass

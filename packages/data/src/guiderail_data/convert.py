@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.files import visible_files
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_NUMBERS
@@ -18,7 +17,7 @@ from guiderail_data.formats.csv_layouts import read_csv_files
 from guiderail_data.formats.lerobot import INFO, read_lerobot, write_lerobot
 from guiderail_data.formats.recorded import describe_time_shift
 from guiderail_data.formats.ros_bag import find_bags, read_bags, write_mcap
-from guiderail_data.reading import load_demonstrations
+from guiderail_data.reading import load_demonstrations, visible_files
 from guiderail_data.validate import other_units
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}

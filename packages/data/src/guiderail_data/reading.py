@@ -1,9 +1,10 @@
 """Demonstrations of a file or of a folder of files."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.files import visible_files
+from guiderail.models.common.files import in_order
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.files import ENDINGS, path_exists
 
@@ -28,3 +29,16 @@ def load_demonstrations(path: Path) -> Demonstrations:
         times, outputs = ([array for part in parts for array in getattr(part, name)] for name in ("times", "outputs"))
         return Demonstrations(times, outputs, parts[0].names)
     return Demonstrations.load(path)
+
+
+def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
+    """Return the paths of the files in a folder with one of the endings, in order; hidden files are left out.
+
+    Raises:
+        InputError: If the name of a folder has one of the endings.
+    """
+    paths = [path for path in folder.iterdir() if path.suffix in endings and not path.name.startswith(".")]
+    for path in paths:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder with the name of a file: rename it, or move it to another place")
+    return in_order(paths)

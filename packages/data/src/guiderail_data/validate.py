@@ -11,7 +11,6 @@ import yaml
 
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.files import visible_files
 from guiderail.models.common.registry import require_sibling
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
@@ -23,7 +22,7 @@ from guiderail.tools.files import (
     path_exists,
     write_atomically,
 )
-from guiderail_data.reading import load_demonstrations
+from guiderail_data.reading import load_demonstrations, visible_files
 
 JUMP_RATIO = 150.0  # ratio of an output's largest to its median speed above which a jump is reported
 GAP_RATIO = 10.0  # ratio of the longest to the median sampling period above which missing samples are reported

@@ -173,8 +173,7 @@ def test_bag_export_shifts_negative_time(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("times", "message"),
-    [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")],
+    ("times", "message"), [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")]
 )
 def test_bag_export_refuses_time_out_of_range(times, message, tmp_path):
     with pytest.raises(InputError, match=message):

@@ -11,8 +11,8 @@ from enum import IntEnum
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail_hardware.drivers.driver import Driver, status_limits, torque_tolerance
+from guiderail_hardware.models.joint_dynamics import JointDynamics
 from guiderail_hardware.models.joint_status import (
     MAX_MISSED_MESSAGES,
     STATUS_FAULTS,

@@ -13,9 +13,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
+from guiderail.diagrams.envs.options import Field, Number, Options
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.impedance_control import add_controller
-from guiderail.diagrams.stations.options import HardwareOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
@@ -59,6 +59,16 @@ from guiderail_hardware.systems.torque_publisher import TorquePublisher
 from guiderail_hardware.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 
 PROCESS_CHECK_PERIOD = 0.5  # time between checks of the robot's program during the wait for its first status [s]
+
+
+class HardwareOptions(Options):
+    """Options of a station with a real arm."""
+
+    robot: str = Field(DEFAULT_ROBOT, description="name of the arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="name of the tool on the flange")
+    driver: str = Field("", description="driver of the robot; default: the one with the robot's name")
+    robot_url: str = Field("", description="LCM URL of the driver's bus, or host of the robot; default: LCM's default")
+    robot_timeout: Number = Field(10.0, gt=0, description="longest wait for the robot's first status [s]")
 
 
 @register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from injections import faults
-from injections.bus import Bus
+from injections.bus import PERIOD, START, Bus
+
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 RNG = np.random.default_rng(0)
 STATUS, COMMAND = "on_status", "on_command"
@@ -50,3 +52,24 @@ def test_injection_reports_a_missed_or_needless_stop(bus):
     assert replace(tolerated, stops=True).inject(bus).failures == ["not detected"]
     stopping = faults.resized_status(3, 1)
     assert replace(stopping, stops=False).inject(bus).failures == ["stopped the arm: WRONG_SIZE"]
+
+
+def test_contact_with_a_rim_is_no_fault(bus, monkeypatch):
+    """The plug hits the rim beside the bore, and presses with the largest force of the impedance, 40 N."""
+    begin, speed, depth = bus.step, 0.05, 0.04
+    beside = np.array([0.003, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def desired():
+        elapsed = (bus.step - begin) * PERIOD
+        down = np.clip(speed * (elapsed - 1.2), 0.0, depth)
+        return START + min(elapsed, 1.0) * beside - [0.0, 0.0, down, 0.0, 0.0, 0.0]
+
+    bus.start_over()
+    begin = bus.step
+    monkeypatch.setattr(bus, "desired", desired)
+    bus.run_until_following(0.0)
+    while (bus.step - begin) * PERIOD < 1.2 + depth / speed + 0.3:
+        bus.step_once()
+        assert not bus.is_detected, (bus.step * PERIOD, bus.fault, bus.monitor.fault)
+    assert bus.arm_state == ArmState.RUNNING
+    assert np.linalg.norm(bus.station.GetOutputPort("wrench").Eval(bus.simulator.get_context())[:3]) > 30.0

@@ -11,9 +11,9 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail_hardware.drivers.driver import safety_limits, torque_tolerance
 from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver
+from guiderail_hardware.models.joint_dynamics import JointDynamics
 from guiderail_hardware.models.joint_status import HOLD_TIME, MAX_MISSED_MESSAGES, Fault, JointStatus, damping_torque
 from guiderail_hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail_hardware.systems.torque_safety_limiter import ZERO_TORQUE_TIME

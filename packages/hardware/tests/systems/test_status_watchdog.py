@@ -11,7 +11,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInert
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.drake_multibody import JointDynamics
+from guiderail_hardware.models.joint_dynamics import JointDynamics
 from guiderail_hardware.models.joint_status import Fault, JointStatus, StatusLimits
 from guiderail_hardware.systems.status_watchdog import StatusWatchdog
 

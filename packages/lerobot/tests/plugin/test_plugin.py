@@ -262,13 +262,8 @@ def test_recorded_episodes_have_the_wrench_as_a_feature(tmp_path):
     data = LeRobotDataset("lab/connector", root=tmp_path / "data")
     assert data.num_episodes == 2
     assert data.meta.features["observation.wrench"]["names"] == [
-        "Fx [N]",
-        "Fy [N]",
-        "Fz [N]",
-        "Mx [Nm]",
-        "My [Nm]",
-        "Mz [Nm]",
-    ]
+        "Fx [N]", "Fy [N]", "Fz [N]", "Mx [Nm]", "My [Nm]", "Mz [Nm]",
+    ]  # fmt: skip
     forces = torch.stack([data[k]["observation.wrench"][:3].norm() for k in range(len(data))])
     assert torch.isfinite(forces).all()
     assert forces.max() > 1.0  # [N], the plug presses on the rim

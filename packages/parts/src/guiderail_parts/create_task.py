@@ -312,8 +312,8 @@ def _snapping(plug: Part, socket: Part, path: InsertionMotion, deviation: float)
         depth, height = max(overlaps)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
-            f"{1e3 * depth:.2g} mm; give its rotation with --turn and --center, or draw the part that deflects as a "
-            "separate body"
+            f"{1e3 * depth:.2g} mm; give the direction in which it is removed with --axis (+y for files whose y points "
+            "up), its rotation with --turn and --center, or draw the part that deflects as a separate body"
         )
     return blocked
 

@@ -160,7 +160,7 @@ def check_job(job: Job) -> None:
         make_baseline(job.study.task, policy)
     for eval_set in job.study.eval_sets:
         environment = changed_environment(config.task, config.environment, eval_set.env)
-        for end in (0, 1):
+        for end in (0, 1) if eval_set.sampled else (0,):
             sampled = {name: ends[end] for name, ends in eval_set.sampled.items()}
             configure(job.study.task, environment | sampled, episodes=1)
         check_reset(job.study.task, eval_set.options)

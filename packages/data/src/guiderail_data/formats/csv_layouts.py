@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import read_bytes, visible_files
+from guiderail.models.common.files import read_bytes
 from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
@@ -34,6 +34,7 @@ from guiderail_data.formats.recorded import (
     poses_in_target,
     rotations_of,
 )
+from guiderail_data.reading import visible_files
 
 TIME = re.compile(r"(?:%|__)?(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)  # names of a time column
 _STAMP = r"(?:.*[._/ ])?"  # prefix of the seconds and nanoseconds of a ROS message's stamp

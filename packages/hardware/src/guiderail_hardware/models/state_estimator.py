@@ -184,7 +184,9 @@ class StateEstimator:
       between two checks,
       |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
       The last term, with a faster decay, accepts collisions, which change the velocity before the external torque. It
-      is zero for a joint that does not react. Δv_noise and Δv_max are `velocity_noise` and `velocity_jump`.
+      is zero for a joint that does not react. Δv_noise and Δv_max are `velocity_noise` and `velocity_jump`. A status
+      that needs this term is held back: it is not used, and neither are the next ones until the velocity agrees with
+      the prediction from torques, which include the external torque of held statuses. After `max_age` it is a fault.
 
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
@@ -281,7 +283,7 @@ class StateEstimator:
             # The prediction, unlike the sums of momentum, does not decay.
             deviation = np.abs(values[self._velocities] - state.velocity)
             is_contradictory |= status.time - before.accepted_time > self._limits.max_age
-        is_explained = is_doubted or (deviation <= explained).all()
+        is_explained = (deviation <= explained).all()
         fault = fault or self._find_contradiction(state, bool(is_contradictory and not is_explained))
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
@@ -481,8 +483,8 @@ class StateEstimator:
         """Return the velocity change by recent torques that the reported velocity lacks (n,) [rad/s], and a mask (n,).
 
         The change is computed with and without the external torques, and the smaller result is used. A change in the
-        last period is complete: its decay is compensated. The mask is true
-        if both results have the same sign. Otherwise, not the velocity but the external torque is wrong.
+        last period is complete: its decay is compensated. The mask is true if both results have the same sign.
+        Otherwise, not the velocity but the external torque is wrong.
         """
         sums = np.transpose([state.predicted, state.commanded] - state.measured)
         missing = np.exp(self._period / MOMENTUM_WINDOW) * np.linalg.inv(M) @ sums

@@ -413,8 +413,8 @@ def recordings_folder(run: Path) -> Path:
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
     """Return a run's environment options without those of the station that it was trained on and its disturbances.
 
-    A real robot has disturbances of its own; only `sensing` and the tare remain. A reward that needs
-    simulation state is replaced by the task's first reward without it; no policy uses rewards.
+    A real robot has disturbances of its own; only `sensing` and the tare remain. A reward that needs simulation state
+    is replaced by the task's first reward without it; no policy uses rewards.
 
     Raises:
         InputError: If `station` is unknown or simulated.

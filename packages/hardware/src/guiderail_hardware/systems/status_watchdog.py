@@ -10,7 +10,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import JointDynamics, check_plant
+from guiderail.systems.support.drake_multibody import check_plant
+from guiderail_hardware.models.joint_dynamics import JointDynamics
 from guiderail_hardware.models.joint_status import JointStatus, StatusLimits
 from guiderail_hardware.models.state_estimator import Estimate, EstimatorState, StateEstimator
 

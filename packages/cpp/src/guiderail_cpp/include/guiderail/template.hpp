@@ -632,7 +632,7 @@ class TemplateGuidance {
         for (int i = 0; i < 6; ++i) is_constrained_ = is_constrained_ || !(std::abs(desired[i] - requested[i]) <= 1e-9);
         const Vec3 measured{measured_[0], measured_[1], measured_[2]};
         const double error = distance({last_[0], last_[1], last_[2]}, measured);
-        const bool reduces_error = distance({desired[0], desired[1], desired[2]}, measured) < error;
+        const bool reduces_error = distance({desired[0], desired[1], desired[2]}, measured) < error - kRounding;
         const bool is_waiting = error > max_tracking_error_ && !reduces_error;
         if (!is_waiting && is_finite(desired.data(), 6)) {
           output_ = desired;
@@ -653,6 +653,8 @@ class TemplateGuidance {
   void constrain(const std::array<double, 6>& requested, std::array<double, 6>& desired) {
     transform_to_pose(template_.command(state_, pose_to_transform(last_.data()), pose_to_transform(requested.data()), period_), desired.data());
   }
+
+  static constexpr double kRounding = 1e-9;
 
   Template template_, mapping_;
   bool has_own_mapping_;

@@ -2,7 +2,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 
-from guiderail.systems.support.drake_multibody import JointDynamics
+from guiderail_hardware.models.joint_dynamics import JointDynamics
 
 
 def test_damping_acts_on_its_joint_in_any_order_of_declaration():
