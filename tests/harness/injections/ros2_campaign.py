@@ -50,7 +50,7 @@ from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
-from injections.campaign import DURATION, MAX_STEPS, SLOW, SLOW_AFTER, Result, has_effect, print_table
+from injections.campaign import DURATION, MAX_STEPS, SENSITIVITY, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
 from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind
 
@@ -72,8 +72,10 @@ NAMES = [f"panda_joint{number}" for number in range(1, 8)]
 WITHOUT_DECODING = ("random bytes", "message cut off")  # the middleware decodes messages
 WITHOUT_TORQUES = "torques times"  # commands are poses
 OTHER_ROBOTS = ("second robot", "moving robot", "resting robot")
-# Positions and velocities of this arm differ by about 1 mrad by themselves, so that a slow drift takes longer to show.
+# Positions and velocities of this arm differ by about 1 mrad by themselves, so that a slow drift takes longer to show,
+# and a wrong position must differ by more to show.
 SLOW_DRIFT, SLOW_DRIFT_BOUND = "position drift 9 mrad/s", 0.9
+ROS2_SENSITIVITY = {**SENSITIVITY, Q: 2.0 * SENSITIVITY[Q]}
 
 
 def _is_latency(kind: Kind) -> bool:
@@ -285,7 +287,9 @@ class Arm:
             for each, is_other in relayed:
                 for out in fault(each, self._since(start)):
                     changed.append((out, is_other or (out != each and kind.name.startswith(OTHER_ROBOTS))))
-            effect |= kind in OWN_KINDS or has_effect(message, [out for out, _ in changed], kind.where)
+            effect |= kind in OWN_KINDS or has_effect(
+                message, [out for out, _ in changed], kind.where, ROS2_SENSITIVITY
+            )
             relayed = changed
         names = {kind.name for kind, _, _ in self._faults}
         for content, is_other in relayed:
@@ -538,7 +542,9 @@ class Campaign:
                 if elapsed - (result.detected if bound > SLOW_AFTER else 0.0) > SLOW_AFTER - 1e-9:
                     result.late_speed = max(result.late_speed, self.speed)
         self._end(programs)
-        is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
+        # A program that does not run detects nothing.
+        has_run = "controller" not in {program for _, program in programs}
+        is_detectable = any(kind.is_detectable for kind in kinds) and start is not None and has_run
         if is_detectable and not result.detected <= bound + 1e-9:
             result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
         is_silent = any(kind.name in SILENT for kind in kinds)
