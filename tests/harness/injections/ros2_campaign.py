@@ -52,7 +52,7 @@ from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 from injections.campaign import DURATION, MAX_STEPS, SENSITIVITY, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
-from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind
+from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind, Q
 
 RADIUS, ROTATION, FREQUENCY = 0.01, 0.15, 1.0  # amplitudes and frequency of the motion [m], [rad], [Hz]
 BANDWIDTH = 60.0  # natural frequency of the critically damped arm [rad/s]
