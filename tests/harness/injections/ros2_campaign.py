@@ -18,6 +18,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -76,6 +77,12 @@ OTHER_ROBOTS = ("second robot", "moving robot", "resting robot")
 # and a wrong position must differ by more to show.
 SLOW_DRIFT, SLOW_DRIFT_BOUND = "position drift 9 mrad/s", 0.9
 ROS2_SENSITIVITY = {**SENSITIVITY, Q: 2.0 * SENSITIVITY[Q]}
+
+
+def _latency(kind: Kind) -> float:
+    """Return the constant delay of a kind of fault that is not reported [s]; 0 for any other kind."""
+    found = re.search(r"(\d+) ms late", kind.name)
+    return float(found[1]) / 1000.0 if found and not kind.is_detectable else 0.0
 
 
 def _is_latency(kind: Kind) -> bool:
@@ -515,6 +522,7 @@ class Campaign:
         """Inject one or more faults at the same time, and observe the arm for at least `DURATION`."""
         result, first_step, start = Result(np.nan, "", 0.0, 0.0, []), self.step, None
         bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
+        bound += sum(map(_latency, kinds))  # a fault cannot be seen before its status arrives
         self.ask(do="begin", kinds=[kind.name for kind in kinds], seed=seed)
         programs = {kind.action for kind in kinds if kind.make is None}
         for action, program in programs:
