@@ -25,7 +25,7 @@ import multiprocessing
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -90,7 +90,9 @@ def undisturbed_speeds(bus: Bus) -> np.ndarray:
     return speeds
 
 
-def has_effect(message: bytes, relayed: list[bytes], where: str) -> bool:
+def has_effect(
+    message: bytes, relayed: list[bytes], where: str, sensitivity: Mapping[str, float] = SENSITIVITY
+) -> bool:
     """Return True if a message is changed by at least the sensitivity, dropped or duplicated."""
     if where == "command" or len(relayed) != 1:
         return relayed != [message]
@@ -100,10 +102,10 @@ def has_effect(message: bytes, relayed: list[bytes], where: str) -> bool:
         return True
     for field in lcmt_iiwa_status.__slots__:
         first, second = getattr(before, field), getattr(after, field)
-        if field not in SENSITIVITY or len(first) != len(second):
+        if field not in sensitivity or len(first) != len(second):
             if first != second:
                 return True
-        elif not (np.abs(np.subtract(first, second)) < SENSITIVITY[field] - 1e-9).all():
+        elif not (np.abs(np.subtract(first, second)) < sensitivity[field] - 1e-9).all():
             return True
     return False
 

@@ -18,6 +18,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -50,9 +51,9 @@ from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
-from injections.campaign import DURATION, MAX_STEPS, SLOW, SLOW_AFTER, Result, has_effect, print_table
+from injections.campaign import DURATION, MAX_STEPS, SENSITIVITY, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
-from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind
+from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind, Q
 
 RADIUS, ROTATION, FREQUENCY = 0.01, 0.15, 1.0  # amplitudes and frequency of the motion [m], [rad], [Hz]
 BANDWIDTH = 60.0  # natural frequency of the critically damped arm [rad/s]
@@ -71,7 +72,17 @@ SECOND_PROGRAMS = {
 NAMES = [f"panda_joint{number}" for number in range(1, 8)]
 WITHOUT_DECODING = ("random bytes", "message cut off")  # the middleware decodes messages
 WITHOUT_TORQUES = "torques times"  # commands are poses
-OTHER_ROBOTS = ("second robot", "moving robot")
+OTHER_ROBOTS = ("second robot", "moving robot", "resting robot")
+# Positions and velocities of this arm differ by about 1 mrad by themselves, so that a slow drift takes longer to show,
+# and a wrong position must differ by more to show.
+SLOW_DRIFT, SLOW_DRIFT_BOUND = "position drift 9 mrad/s", 0.9
+ROS2_SENSITIVITY = {**SENSITIVITY, Q: 2.0 * SENSITIVITY[Q]}
+
+
+def _latency(kind: Kind) -> float:
+    """Return the constant delay of a kind of fault that is not reported [s]; 0 for any other kind."""
+    found = re.search(r"(\d+) ms late", kind.name)
+    return float(found[1]) / 1000.0 if found and not kind.is_detectable else 0.0
 
 
 def _is_latency(kind: Kind) -> bool:
@@ -103,8 +114,16 @@ OWN_KINDS = (
 # Without a safety monitor at the robot, lost commands are not reported: the controller holds its last target. Nor is a
 # constant latency, because the loop of forces is closed at the robot.
 SILENT = ("commands lost", "controller killed", "controller stopped")
+
+
+def _bound(kind: Kind) -> float:
+    if kind.name in SILENT or _is_latency(kind):
+        return UNDETECTED
+    return SLOW_DRIFT_BOUND if kind.name == SLOW_DRIFT else kind.bound
+
+
 CAMPAIGN = [
-    replace(kind, bound=UNDETECTED) if kind.name in SILENT or _is_latency(kind) else kind
+    replace(kind, bound=_bound(kind))
     for kind in (*KINDS, *OWN_KINDS)
     if kind.name not in WITHOUT_DECODING and kind.action[1] != "monitor" and not kind.name.startswith(WITHOUT_TORQUES)
 ]
@@ -275,7 +294,9 @@ class Arm:
             for each, is_other in relayed:
                 for out in fault(each, self._since(start)):
                     changed.append((out, is_other or (out != each and kind.name.startswith(OTHER_ROBOTS))))
-            effect |= kind in OWN_KINDS or has_effect(message, [out for out, _ in changed], kind.where)
+            effect |= kind in OWN_KINDS or has_effect(
+                message, [out for out, _ in changed], kind.where, ROS2_SENSITIVITY
+            )
             relayed = changed
         names = {kind.name for kind, _, _ in self._faults}
         for content, is_other in relayed:
@@ -498,9 +519,10 @@ class Campaign:
         return max(self.ask(do="predict", targets=ahead)["speeds"])
 
     def inject(self, kinds: tuple[Kind, ...], seed: list[int]) -> Result:
-        """Inject one or more faults at the same time, and observe the arm for `DURATION`."""
+        """Inject one or more faults at the same time, and observe the arm for at least `DURATION`."""
         result, first_step, start = Result(np.nan, "", 0.0, 0.0, []), self.step, None
         bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
+        bound += sum(map(_latency, kinds))  # a fault cannot be seen before its status arrives
         self.ask(do="begin", kinds=[kind.name for kind in kinds], seed=seed)
         programs = {kind.action for kind in kinds if kind.make is None}
         for action, program in programs:
@@ -511,7 +533,8 @@ class Campaign:
             start = self.step
         reach = round((bound if np.isfinite(bound) else DURATION) / PERIOD) + 4
         speed, elapsed = 0.0, 0.0
-        while elapsed < DURATION - 1e-9 and self.step - first_step < MAX_STEPS:
+        duration = max(DURATION, np.nan_to_num(bound) + SLOW_AFTER)
+        while elapsed < duration - 1e-9 and self.step - first_step < MAX_STEPS:
             before = self.speed
             self.step_once()
             if start is None and self.has_effect:
@@ -523,10 +546,13 @@ class Campaign:
                 result.detected, result.cause = elapsed, self.fault.name
             if self.has_robot and start is not None:
                 result.growth = max(result.growth, self.speed / speed)
-                if elapsed > SLOW_AFTER - 1e-9:
+                # A fault with a longer bound than `SLOW_AFTER` has no effect until its detection.
+                if elapsed - (result.detected if bound > SLOW_AFTER else 0.0) > SLOW_AFTER - 1e-9:
                     result.late_speed = max(result.late_speed, self.speed)
         self._end(programs)
-        is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
+        # A program that does not run detects nothing.
+        has_run = "controller" not in {program for _, program in programs}
+        is_detectable = any(kind.is_detectable for kind in kinds) and start is not None and has_run
         if is_detectable and not result.detected <= bound + 1e-9:
             result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
         is_silent = any(kind.name in SILENT for kind in kinds)
