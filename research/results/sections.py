@@ -47,6 +47,14 @@ def _baselines(
     return [Row(name, study, method, eval_set) for name, method in zip(names, methods, strict=True)]
 
 
+def _guided_and_residual(study: str) -> list[Row]:
+    names = {
+        "KGRL": "kgrl", "sKGRL, adaptive history": "skgrl_adaptive", "residual RL": "residual",
+        "safe residual RL": "safe_residual",
+    }  # fmt: skip
+    return [Row(name, study, method) for name, method in names.items()]
+
+
 # Methods of the baseline policies in most studies, in the order of `BASELINES`.
 _ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
 _ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
@@ -58,10 +66,7 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Connector, hard, converged contact",
             [
-                Row("KGRL", "connector_hard_converged", "kgrl"),
-                Row("sKGRL, adaptive history", "connector_hard_converged", "skgrl_adaptive"),
-                Row("residual RL", "connector_hard_converged", "residual"),
-                Row("safe residual RL", "connector_hard_converged", "safe_residual"),
+                *_guided_and_residual("connector_hard_converged"),
                 *_baselines("connector_hard_converged", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
             ],
             guided=("KGRL", "sKGRL, adaptive history"),
@@ -88,10 +93,7 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Connector, hard, contact at 10 ms",
             [
-                Row("KGRL", "peers_connector_hard", "kgrl"),
-                Row("sKGRL, adaptive history", "peers_connector_hard", "skgrl_adaptive"),
-                Row("residual RL", "peers_connector_hard", "residual"),
-                Row("safe residual RL", "peers_connector_hard", "safe_residual"),
+                *_guided_and_residual("peers_connector_hard"),
                 Row("residual RL, covariance without constraints", "peers_connector_hard", "residual_covariance"),
                 Row("residual RL, control barrier function", "peers_connector_hard", "residual_cbf"),
                 Row("residual RL, tangent space", "peers_connector_hard", "residual_tangent"),
@@ -134,10 +136,7 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Connector, hard, commands within 2.8 mm",
             [
-                Row("KGRL", "connector_hard_safety", "kgrl"),
-                Row("sKGRL, adaptive history", "connector_hard_safety", "skgrl_adaptive"),
-                Row("residual RL", "connector_hard_safety", "residual"),
-                Row("safe residual RL", "connector_hard_safety", "safe_residual"),
+                *_guided_and_residual("connector_hard_safety"),
                 *_baselines("connector_hard_safety", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
             ],
         ),

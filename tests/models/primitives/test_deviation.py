@@ -31,9 +31,11 @@ def test_primitive_refuses_millimeters_at_one_step():
 
 @pytest.mark.parametrize("scale", [1.0, 1e3])
 def test_primitive_accepts_constraints_in_the_same_unit(scale):
-    primitive(LinearConstraints.box(*(scale * BOUNDS)), scale)
-    primitive(LinearConstraints.box([5.0 * scale, -np.inf], [np.inf, np.inf]), scale)  # the reference is outside
+    assert primitive(LinearConstraints.box(*(scale * BOUNDS)), scale).num_steps == STEPS
+    outside = LinearConstraints.box([5.0 * scale, -np.inf], [np.inf, np.inf])  # the reference is outside
+    assert primitive(outside, scale).num_steps == STEPS
 
 
 def test_constraint_may_exclude_a_constant_reference():
-    primitive(LinearConstraints.box([500.0, -np.inf], [np.inf, np.inf]), means=np.full((STEPS, 2), 0.35))
+    constraints = LinearConstraints.box([500.0, -np.inf], [np.inf, np.inf])
+    assert primitive(constraints, means=np.full((STEPS, 2), 0.35)).num_steps == STEPS
