@@ -143,7 +143,7 @@ class EstimatorState:
         return replace(self, **{name: getattr(self, name) + seconds for name in names})
 
     def reported_speed(self, period: float) -> float:
-        """Return the largest joint speed of the last readable status [rad/s]; NaN without one in two periods [s]."""
+        """Return the largest joint speed of the last readable status [rad/s]; NaN without one in three periods [s]."""
         is_fresh = self.check_time - self.receipt_time <= 3.0 * period
         return float(np.abs(np.split(self.last_values, 3)[1]).max()) if is_fresh else np.nan
 
