@@ -124,32 +124,38 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 
 def methods_table(methods: Sequence[tuple[str, pd.DataFrame]], is_brief: bool = False) -> str:
-    """Return the Markdown table of methods; a sentence replaces a column in which all methods are equal.
+    """Return the Markdown table of learned methods, and a sentence with the success of policies without learning.
+
+    Another sentence replaces a column in which all learned methods are equal.
 
     Args:
         methods: Name and rows of each method.
         is_brief: True for success, stops and violations only.
     """
-    rows = [(name, *_method_cells(seeds)) for name, seeds in methods]
-    trained = [is_trained(seeds) for _, seeds in methods]
-    values = [
-        {cell for cell, learns in zip(column, trained, strict=True) if learns or cell != MISSING}
-        for column in zip(*rows, strict=True)
-    ]
+    rows = [(name, *_method_cells(seeds)) for name, seeds in methods if is_trained(seeds)]
+    fixed = [f"{name} {_fixed_cell(seeds)}" for name, seeds in methods if not is_trained(seeds)]
     columns = BRIEF if is_brief else range(len(COLUMNS))
+    values = {index: {row[index] for row in rows} for index in columns}
     kept = [index for index in columns if len(values[index]) > 1 or index in ALWAYS]
-    equal = {COLUMNS[i]: "".join(values[i] - {MISSING}) for i in columns if i not in kept}
-    sentences = "; ".join(f"{name}: {value}" for name, value in equal.items() if value)
-    caption = f"The same for all methods: {sentences}.\n\n" if sentences else ""
-    return caption + markdown_table([COLUMNS[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    equal = {COLUMNS[index]: cell for index in columns if index not in kept for cell in values[index]}
+    sentences = "; ".join(f"{name}: {cell}" for name, cell in equal.items() if cell != MISSING)
+    parts = [f"The same for all learned methods: {sentences}."] if sentences else []
+    if rows:
+        parts.append(markdown_table([COLUMNS[i] for i in kept], [[row[i] for i in kept] for row in rows]))
+    if fixed:
+        parts.append(f"Without learning: {'; '.join(fixed)}.")
+    return "\n\n".join(parts)
+
+
+def _fixed_cell(seeds: pd.DataFrame) -> str:
+    """Return the success of a policy that does not learn, and its largest violation if it has any."""
+    success = _interval(seeds.iloc[0].to_dict()) if len(seeds) == 1 else success_cell(seeds)
+    violation = largest_violation([_safety(seeds, "")])
+    return success if violation == "none" else f"{success}, violation {violation}"
 
 
 def _method_cells(seeds: pd.DataFrame) -> tuple[str, ...]:
-    """Return the cells of a method's row after its name: of all its seeds together, not of each."""
-    if not is_trained(seeds):
-        parts = [_safety(seeds, "")]
-        success = _interval(seeds.iloc[0].to_dict()) if len(seeds) == 1 else success_cell(seeds)
-        return "–", success, "–", "–", "–", largest_violation(parts), _forces(parts)
+    """Return the cells of a learned method's row after its name: of all its seeds together, not of each."""
     held_out = _is_evaluated(seeds)
     success = success_cell(seeds) if held_out else f"{mean_and_range(seeds, 'training_success_rate')} in training"
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]

@@ -1,8 +1,10 @@
 """Tables of all methods on the pages of results and in the README."""
 
+import io
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from guiderail.tools.learning.learner_config import LEARNERS
@@ -12,6 +14,7 @@ from research.results.methods import (
     README_TITLES,
     hard_tasks_table,
     knowledge,
+    methods_table,
     offsets,
     replace_table,
     task_table,
@@ -71,7 +74,10 @@ def test_guided_methods_are_rows_of_their_section():
 def test_missing_study_is_left_out(tmp_path):
     name = "connector_hard_baselines.csv"
     (tmp_path / name).write_bytes((TABLES / name).read_bytes())
-    assert [row[0] for row in rows(task_table("BncConnector", tmp_path))] == list(BASELINES)
+    (sentence,) = (line for line in task_table("BncConnector", tmp_path).splitlines() if line.startswith("Without"))
+    assert rows(task_table("BncConnector", tmp_path)) == []
+    names = [part.split(" (")[0].rpartition(" ")[0] for part in sentence.removeprefix("Without learning: ").split("; ")]
+    assert names == list(BASELINES)
     assert task_table("BncConnector", tmp_path / "nowhere") == ""
     assert rows(hard_tasks_table(tmp_path)) == []
     assert len(NO_DEMONSTRATION) == len(BASELINES)
@@ -137,6 +143,21 @@ def test_fewer_than_five_seeds_have_no_interval(num_seeds, cell, tmp_path):
     assert rows(text)[0][2] == cell
     interval = " (95 %: 1.00–1.00)" if num_seeds == 5 else ""
     assert f"residual RL: KGRL 1.00{interval}." in text
+
+
+def test_policies_without_learning_are_a_sentence_with_violations():
+    columns = "method,seed,after_episodes,eval_set,episodes,success_rate,success_low,success_high,"
+    table = pd.read_csv(
+        io.StringIO(
+            f"{columns}max_commanded_violation,violating_episodes\n"
+            "scripted,0,0,fresh,100,0.98,0.93,0.994,-0.1,0\nuniform,0,0,fresh,100,0.5,0.4,0.6,0.0002,7\n"
+        )
+    ).assign(peak_force=1.0)
+    text = methods_table([("scripted policy", table[:1]), ("random", table[1:])])
+    assert text == (
+        "Without learning: scripted policy 98 (93.0–99.4) of 100; "
+        "random 50 (40.0–60.0) of 100, violation 0.20 mm, in 7 episodes."
+    )
 
 
 def test_brief_table_has_success_stops_and_violations(tmp_path):

@@ -40,7 +40,7 @@ def connector_study(tmp_path):
 
 def test_page_has_one_row_for_a_method_and_no_seeds(connector_study, tmp_path):
     page = write_results([connector_study], tmp_path / "results")
-    assert "The same for all methods: training episodes (seeds): 40 (30, 31); " in page
+    assert "The same for all learned methods: training episodes (seeds): 40 (30, 31); " in page
     assert "| sKGRL | 98 (97–100) |" in page
     assert "guiderail study research/studies/NAME.yaml --out studies" in page
     assert "- `connector`, not run: skgrl, seeds 32–34; kgrl" in page
