@@ -32,7 +32,7 @@ from research.stored import continue_run, evaluate_stored, report
 TRAINING, HELD_OUT = 60, 30  # numbers of parts
 HELD_OUT_FRACTION = 0.34  # fraction of all pairs from which the held-out parts are taken
 ENVIRONMENT = {"guidance": "kgrl", "difficulty": "hard", "observation": "shared"}
-SETTINGS = {"symmetry": "near", "constant_episodes": 12}
+SETTINGS = {"symmetry": "near", "exploration.constant_episodes": 12}
 EASY_RANDOM, EASY_SEARCH = 0.2, 0.9  # success rates above which a part cannot show learning
 
 
@@ -69,7 +69,7 @@ def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Pa
     names = [task_named(str(part)) for part in parts]
     if not continue_run(run, episodes):
         imports = [folder for _, folders in names for folder in folders]
-        choices = Choices(settings=SETTINGS, episodes=episodes, seed=seed, step_log=False)
+        choices = Choices(preset="tqc_contact", settings=SETTINGS, episodes=episodes, seed=seed, step_log=False)
         Training(run, [name for name, _ in names], ENVIRONMENT, choices, imports=imports, pictures=False).start()
     return run
 

@@ -61,6 +61,7 @@ class LearnerConfig:
             never. Resuming such a run runs no further episodes.
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
+        demonstrator: Run or `pretrained:NAME` whose policy demonstrates; by default the task's scripted policy.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
         pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
             older. The result is deterministic too.
@@ -78,6 +79,7 @@ class LearnerConfig:
     stop_after_successes: NonNegative = 0
 
     demonstration_episodes = 0
+    demonstrator = ""
     symmetry = cast("Symmetries", False)
     pipelined = False
     num_envs = 0

@@ -101,7 +101,10 @@ def run_training(
             episodes = Episodes(config, make_run_environment(config), demonstrator)
         stack.callback(lambda: episodes.close())
         env = episodes.env
-        if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
+        number = config.learner.demonstration_episodes
+        if demonstrator is not None and config.learner.demonstrator:
+            demonstrator(env)  # raises an InputError that names the difference
+        elif demonstrator is not None and number and not is_compatible(demonstrator, env):
             raise InputError(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
