@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from guiderail.diagrams.envs.options import flat_options, option_fields
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError, brief
@@ -32,6 +33,7 @@ from guiderail.tools.evaluation.policies import (
     load_policy,
 )
 from guiderail.tools.files import path_exists
+from guiderail.tools.learning.learner import INTERFACE_OPTIONS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, configure
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
@@ -147,7 +149,8 @@ def find_subject(
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` or `as_policy` takes,
             or the name of a baseline policy.
         env: Name of the task, or an environment, that a policy without a run acts in; None for a run.
-        environment: Options of the task's environment that differ from the defaults; unused for a run.
+        environment: Options of the task's environment that differ from the defaults; unused for a run. `guidance` and
+            `observation` are by default those with which a policy of this package was trained.
         trust_policy: True to read a policy file that can execute code.
     """
     if isinstance(policy, os.PathLike):
@@ -166,20 +169,38 @@ def find_subject(
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder.path))
-    config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
+    options = environment or {}
+    source = find_run(policy) if isinstance(policy, Path | str) else None
+    acting = None
+    if source is not None and (is_policy_file(policy) or (path_exists(source) and source.is_dir())):
+        acting = load_policy(source, trust_policy=trust_policy)
+        if isinstance(acting, Policy) and not isinstance(env, gymnasium.Env):
+            options = _interface(acting, env) | flat_options(options)
+    config = None if isinstance(env, gymnasium.Env) else configure(env, options)
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
         digest = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
         if isinstance(act, FunctionPolicy) or (act is policy and not isinstance(act, Policy)):
             return Subject("policy", config, lambda env: act, digest=digest)
         return Subject("policy", config, partial(check_compatible, act), digest=digest)
-    source = find_run(policy)
-    if is_policy_file(policy) or (path_exists(source) and source.is_dir()):
-        make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
+    if source is not None and acting is not None:
+        make_policy = partial(check_compatible, acting)
         return Subject(source.name.replace(":", "."), config, make_policy, digest=policy_digest(source))
     name = str(policy)
     make_policy = partial(_make_compatible, name, make_baselines(config, {}, [name])[name])
     return Subject(name, config, make_policy, digest=name)
+
+
+def _interface(policy: Policy, task: str) -> dict[str, Any]:
+    """Return the options with which a policy was trained and on which the meaning of its actions depends.
+
+    Options that the task does not have are left out.
+    """
+    declared = policy.description.get("environment", {})
+    if task not in TASKS.names() or not isinstance(declared, Mapping):
+        return {}
+    known = {*INTERFACE_OPTIONS} & {"guidance", *option_fields(TASKS.get(task))}
+    return {name: value for name, value in declared.items() if name in known}
 
 
 def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:

@@ -34,7 +34,7 @@ from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
     LearningLog,
-    describe_interface,
+    describe_policy,
     divergence_error,
     learner_arguments,
 )
@@ -352,7 +352,7 @@ class TrainingLoop:
         config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
         try:
             with _naming_failures(config, name, ValueError):
-                policy = self._learner.policy({"task": config.task, **describe_interface(self._episodes.env)})
+                policy = self._learner.policy(describe_policy(config, self._episodes.env))
         except InputError:
             raise
         except ValueError as error:

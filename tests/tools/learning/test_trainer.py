@@ -120,7 +120,7 @@ def test_policy_of_a_run_demonstrates(bead_config, bead_run, tmp_path):
 def test_demonstrating_run_of_another_environment_is_refused_by_the_difference(bead_config, bead_run, tmp_path):
     config = with_demonstrations(bead_config, 1)
     config = replace(config, learner=replace(config.learner, demonstrator="pretrained:passage"))
-    with pytest.raises(InputError, match="the policy takes observations .* and this environment has observations"):
+    with pytest.raises(InputError, match=r"the policy takes observations .* and this environment has observations"):
         run_training(RunFolder(tmp_path / "demonstrated"), config, demonstrator=episodes.make_demonstrator(config))
     assert not (tmp_path / "demonstrated").exists()
 
