@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium
 
-from guiderail.diagrams.envs.options import flat_options, option_fields
+from guiderail.diagrams.envs.options import flat_options
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError, brief
@@ -169,14 +169,11 @@ def find_subject(
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder.path))
-    options = environment or {}
     source = find_run(policy) if isinstance(policy, Path | str) else None
     acting = None
     if source is not None and (is_policy_file(policy) or (path_exists(source) and source.is_dir())):
         acting = load_policy(source, trust_policy=trust_policy)
-        if isinstance(acting, Policy) and not isinstance(env, gymnasium.Env):
-            options = _interface(acting, env) | flat_options(options)
-    config = None if isinstance(env, gymnasium.Env) else configure(env, options)
+    config = None if isinstance(env, gymnasium.Env) else _configure(acting, env, environment or {})
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
         digest = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
@@ -191,16 +188,20 @@ def find_subject(
     return Subject(name, config, make_policy, digest=name)
 
 
-def _interface(policy: Policy, task: str) -> dict[str, Any]:
-    """Return the options with which a policy was trained and on which the meaning of its actions depends.
+def _configure(policy: PolicyFn | None, task: str, options: Mapping[str, Any]) -> RunConfig:
+    """Return the configuration of a task for a policy.
 
-    Options that the task does not have are left out.
+    Options on which the meaning of a policy's actions depends have by default the values with which it was trained, if
+    the task accepts them; otherwise `check_compatible` names the difference.
     """
-    declared = policy.description.get("environment", {})
-    if task not in TASKS.names() or not isinstance(declared, Mapping):
-        return {}
-    known = {*INTERFACE_OPTIONS} & {"guidance", *option_fields(TASKS.get(task))}
-    return {name: value for name, value in declared.items() if name in known}
+    declared = policy.description.get("environment") if isinstance(policy, Policy) else None
+    if isinstance(declared, Mapping):
+        own = {name: declared[name] for name in INTERFACE_OPTIONS if name in declared}
+        try:
+            return configure(task, own | flat_options(options))
+        except InputError:
+            pass
+    return configure(task, options)
 
 
 def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:

@@ -24,7 +24,6 @@ def test_given_options_replace_those_of_the_policy(policy):
     assert (environment["guidance"], environment["observation"]) == ("kgrl", "state")
 
 
-def test_options_that_the_task_does_not_have_are_left_out(policy):
+def test_options_that_the_task_does_not_accept_are_left_out(policy):
     environment = find_subject(policy, "NarrowPassage").config.environment
-    assert environment["guidance"] == "kgrl"
-    assert "observation" not in environment
+    assert environment["observation"] == "state"
