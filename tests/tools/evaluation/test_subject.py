@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.subject import find_subject
 
@@ -27,3 +28,8 @@ def test_given_options_replace_those_of_the_policy(policy):
 def test_options_that_the_task_does_not_accept_are_left_out(policy):
     environment = find_subject(policy, "NarrowPassage").config.environment
     assert environment["observation"] == "state"
+
+
+def test_policy_without_a_run_needs_a_task(policy):
+    with pytest.raises(InputError, match="is a policy without a run: name the task"):
+        find_subject(policy, None)
