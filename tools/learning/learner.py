@@ -65,8 +65,6 @@ class LearnerConfig:
             their transitions.
         demonstrator: Run or `pretrained:NAME` whose policy demonstrates; by default the task's scripted policy.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
-        pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
-            older. The result is deterministic too.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
@@ -83,7 +81,6 @@ class LearnerConfig:
     demonstration_episodes = 0
     demonstrator = ""
     symmetry = cast("Symmetries", False)
-    pipelined = False
     num_envs = 0
 
 

@@ -73,7 +73,6 @@ class OffPolicyConfig(LearnerConfig):
     demonstration_episodes: NonNegative = 0  # first episodes, in which a demonstrator acts
     demonstrator: RunName = ""  # run or pretrained:NAME whose policy demonstrates; default: the scripted policy
     symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
-    pipelined: bool = False  # learn in a second process, with weights that are one episode older
     num_envs: Annotated[NonNegative, Field(le=1024)] = 0  # processes that simulate episodes; 0: only this one
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
@@ -105,8 +104,6 @@ class OffPolicyConfig(LearnerConfig):
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
             raise InputError("demonstration_fraction needs demonstrations: give --set demonstration_episodes=... too")
-        if self.demonstration_fraction and self.pipelined:
-            raise InputError("demonstration_fraction does not work with pipelined=true: leave one of them out")
         if self.demonstrator and not self.demonstration_episodes:
             raise InputError("demonstrator acts in the demonstrations: give --set demonstration_episodes=... too")
         if self.init_from and self.demonstration_episodes:

@@ -130,18 +130,12 @@ def run_training(
         if observers.sb3_callbacks is not None:
             from guiderail.tools.learning.episodes import Sb3Callbacks
 
-            if config.learner.pipelined or config.learner.num_envs:
-                raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
+            if config.learner.num_envs:
+                raise InputError("callbacks need the episodes in this process: leave num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
-        if config.learner.pipelined:
-            from guiderail.tools.learning.networks import SpacesOnlyEnv
-            from guiderail.tools.learning.processes import PipelinedLearner
-
-            child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
-            learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
-        elif config.learner.num_envs:
-            from guiderail.tools.learning.processes import ActorEpisodes
+        if config.learner.num_envs:
+            from guiderail.tools.learning.actors import ActorEpisodes
 
             episodes = ActorEpisodes(episodes, learner)
             closed_first.callback(episodes.end)
@@ -164,10 +158,8 @@ def run_training(
 
 def _check_combination(config: RunConfig, *, has_demonstrator: bool, is_supervised: bool) -> None:
     """Raise an InputError if settings are incompatible, or a demonstrator or a supervisor is missing."""
-    if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
-        raise InputError(
-            "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
-        )
+    if config.learner.num_envs and config.human_in_the_loop:
+        raise InputError("num_envs does not work with --human-in-the-loop: leave one of them out")
     if config.human_in_the_loop and config.members:
         raise InputError("a supervisor corrects one environment: leave --human-in-the-loop out, or name one task")
     if config.human_in_the_loop and not is_supervised:

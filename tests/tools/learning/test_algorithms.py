@@ -171,14 +171,13 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
     ("settings", "message"),
     [
         ({"demonstration_fraction": 0.5}, "needs demonstrations: give --set demonstration_episodes"),
-        ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
         ({"demonstrator": "runs/a"}, "demonstrator acts in the demonstrations: give --set demonstration_episodes"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
         *(
             ({"algorithm": "ppo", name: 1}, f"ppo has no setting '{name}'")
-            for name in ("demonstration_episodes", "symmetry", "pipelined", "num_envs")
+            for name in ("demonstration_episodes", "symmetry", "num_envs")
         ),
     ],
 )
