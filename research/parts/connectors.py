@@ -101,10 +101,8 @@ class Model:
             for name, shape in self.shapes[link].items():
                 if name not in left_out:
                     solids.append(shape.transform(to_first[:3]).warp_batch(lambda points: np.round(points, GRID)))
-        # A closed cavity would be a body turned inside out; nothing can reach it, so it is filled.
-        bodies = [body for body in Manifold.batch_boolean(solids, OpType.Add).decompose() if body.volume() > 0.0]
         to_frame = UP @ np.linalg.inv(self.poses[frame]) @ self.poses[links[0]]
-        return Manifold.batch_boolean(bodies, OpType.Add).transform(to_frame[:3])
+        return Manifold.batch_boolean(solids, OpType.Add).transform(to_frame[:3])
 
 
 def read_model(file: Path) -> Model:
