@@ -28,7 +28,7 @@ SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
     "parts": ("create-task", "create-tasks"),
     "studies": ("study", "robustness", "converge", "certify", "report", "benchmark"),
-    "data": ("dataset",),
+    "data": ("dataset", "template"),
     "lerobot": (),
     "mujoco": (),
     "cpp": (),

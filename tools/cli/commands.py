@@ -1,4 +1,4 @@
-"""Commands of the core: train, evaluate, ensemble, export, visualize, template, list and demo."""
+"""Commands of the core: train, evaluate, ensemble, export, visualize, list and demo."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -376,23 +376,6 @@ def visualize(
         if path is not None:
             write(path, episode)
             typer.echo(path)
-
-
-template = cli.command_group("template", "Validate shared control templates.")
-
-
-@cli.command("template validate pouring --draw pouring.svg", "validate", template)
-def validate_template(
-    file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
-    draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
-    imports: cli.TemplateImports = None,
-    as_json: cli.Json = False,
-) -> None:
-    """Validate and summarize a shared control template before it is used."""
-    from guiderail.tools.catalog import describe_template
-
-    cli.import_files(imports)
-    print_result(describe_template(file, draw), as_json)
 
 
 @cli.command("list BncConnector", "list")
