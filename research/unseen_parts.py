@@ -19,7 +19,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
-from guiderail.tools.export import write_ensemble
+from guiderail.tools.evaluation.subject import write_ensemble
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import Choices
 from guiderail.tools.learning.train import Training

@@ -31,7 +31,7 @@ SIBLINGS = {
     "data": ("dataset", "template"),
     "lerobot": (),
     "mujoco": (),
-    "cpp": (),
+    "cpp": ("export",),
     "calibration": ("calibrate", "probe"),
 }
 """Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""

@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Ensemble, Policy
 from guiderail.tools.cli.main import main
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.export import write_ensemble
+from guiderail.tools.evaluation.subject import write_ensemble
 
 
 def policy(seed, size=3, **description):
