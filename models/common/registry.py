@@ -27,7 +27,7 @@ GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor", "station:hardware"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "robustness", "converge", "certify", "report", "benchmark"),
+    "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark"),
     "data": ("dataset", "template"),
     "lerobot": (
         "learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy", "guidance:kgrl_base_policy",

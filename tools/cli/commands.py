@@ -1,4 +1,4 @@
-"""Commands of the core: train, evaluate, ensemble, visualize, list and demo."""
+"""Commands of the core: train, evaluate, visualize, list and demo."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -256,24 +256,6 @@ def _table_of(environments: Mapping[str, Mapping[str, float | None]]) -> Iterato
     for name, rates in environments.items():
         cells = ("–" if rates[column] is None else f"{rates[column]:.0%}" for column in columns)
         yield "  ".join([f"{name:<{width}}", *(f"{text:<{cli.COLUMN}}" for text in cells)]).rstrip()
-
-
-@cli.command("ensemble runs/seed0 runs/seed1 runs/seed2 --out runs/mean")
-def ensemble(
-    runs: Annotated[list[str], argument("Folders of runs with the same observations and guidance.", "RUN...")],
-    out: Annotated[Path, option("Folder to write; it must not exist.")],
-    trust_imports: cli.TrustImports = False,
-    as_json: cli.Json = False,
-) -> None:
-    """Write the mean of several runs' policies as one policy.
-
-    The folder is evaluated like a run: guiderail evaluate runs/mean. The standard deviation of the networks' actions is
-    the column disagreement of the step log that evaluate --steps writes.
-    """
-    from guiderail.tools.evaluation.subject import write_ensemble
-
-    members = write_ensemble(runs, out).members
-    print_result({"policy": str(out), "networks": len(members)}, as_json)
 
 
 @dataclass(frozen=True)

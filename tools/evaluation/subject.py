@@ -1,4 +1,4 @@
-"""Policy that is evaluated or shown, the episode that is shown, baseline policies of an evaluation, and ensembles."""
+"""Policy that is evaluated or shown, the episode that is shown, and the baseline policies of an evaluation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.policy import Ensemble, Policy
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, PolicyFn, check_seed
@@ -31,7 +31,7 @@ from guiderail.tools.evaluation.policies import (
     is_policy_file,
     load_policy,
 )
-from guiderail.tools.files import path_exists, write_atomically
+from guiderail.tools.files import path_exists
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, configure
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
@@ -51,30 +51,6 @@ def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> 
             f"the policy was trained with guidance {trained}, and its actions have another meaning with {used}: leave "
             "guidance out of --env, or train a policy with that guidance"
         )
-
-
-def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
-    """Write the mean of several runs' policies as a run folder with the configuration of the first run.
-
-    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run.
-    """
-    if len(runs) < 2:
-        raise InputError("an ensemble has the policies of several runs: name at least two")
-    folders = [RunFolder(find_run(run)) for run in runs]
-    configs = [folder.config() for folder in folders]
-    for config in configs[1:]:
-        refuse_guidance_change(configs[0].environment, config.environment)
-    try:
-        ensemble = Ensemble([Policy.load(folder.path) for folder in folders])
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{error}: give runs of the same task and options") from error
-    folder = RunFolder(out)
-    with folder.locked():
-        folder.create(configs[0])
-        ensemble.save(out, write=write_atomically)
-    return ensemble
 
 
 def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
