@@ -21,13 +21,13 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
-from guiderail.tools.export import write_ensemble
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import Choices
 from guiderail.tools.learning.train import Training
 from guiderail.tools.tables import read_table, write_table
 from guiderail_parts.batch import create_tasks
 from guiderail_parts.pairs import Pair, find_pairs
+from guiderail_studies.ensemble import write_ensemble
 from research.command import Parser, print_result, run_program
 from research.stored import continue_run, evaluate_stored, report
 

@@ -141,26 +141,6 @@ class PpoConfig(OnPolicyConfig):
     ent_coef: Fraction = 0.0  # weight of the entropy in the loss
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class BcConfig(LearnerConfig):
-    """Settings of behavior cloning (BC)."""
-
-    takes_images: ClassVar[bool] = False
-
-    algorithm: str = "bc"
-    demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
-    demonstrator: RunName = ""  # run or pretrained:NAME whose policy demonstrates; default: the scripted policy
-    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
-    learning_rate: Rate = 1e-3
-    gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration
-    batch_size: BatchSize = 64  # transitions
-    net_arch: NetArch = (256, 256)  # units of the hidden layers
-
-    def __post_init__(self) -> None:
-        if not self.demonstration_episodes:
-            raise InputError("bc learns from demonstrations: give --set demonstration_episodes=... of at least 1")
-
-
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
 )  # table 4.1 of the thesis has no batch size and no buffer size; both are from table 3.2

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from numbers import Number
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ from guiderail.tools.learning.environment_set import (
     select_environment,
     trained_set,
 )
-from guiderail.tools.learning.episodes import Demonstrator, Episodes, Supervise
+from guiderail.tools.learning.episodes import ActorEpisodes, Demonstrator, Episodes, Sb3Callbacks, Supervise
 from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
@@ -40,9 +40,6 @@ from guiderail.tools.learning.learner import (
 )
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
-
-if TYPE_CHECKING:
-    from guiderail.tools.learning.episodes import Sb3Callbacks
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -128,15 +125,11 @@ def run_training(
         closed_first.callback(learning_log.close)
         callbacks = None
         if observers.sb3_callbacks is not None:
-            from guiderail.tools.learning.episodes import Sb3Callbacks
-
             if config.learner.num_envs:
                 raise InputError("callbacks need the episodes in this process: leave num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
         if config.learner.num_envs:
-            from guiderail.tools.learning.actors import ActorEpisodes
-
             episodes = ActorEpisodes(episodes, learner)
             closed_first.callback(episodes.end)
         stack.enter_context(closed_first.pop_all())  # the lock is released last: all of these write into the folder

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.actors import ActorEpisodes
+from guiderail.tools.learning.episodes import ActorEpisodes
 from guiderail.tools.learning.run_folder import LOCK, RunFolder
 from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.same_runs import differences

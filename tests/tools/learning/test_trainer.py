@@ -13,7 +13,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
-from guiderail.tools.learning import actors, episodes, trainer
+from guiderail.tools.learning import episodes, trainer
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import SacLearner
 from guiderail.tools.learning.run_folder import RunFolder, configure, resumed_config
@@ -184,8 +184,7 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
     def rollout_with_success(*arguments, index, **options):
         return rollout(*arguments, index=index, **options) | {"success": successes[index]}
 
-    for module in (episodes, actors):
-        monkeypatch.setattr(module, "rollout", rollout_with_success)
+    monkeypatch.setattr(episodes, "rollout", rollout_with_success)
     learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
     config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
     run_training(whole, config)

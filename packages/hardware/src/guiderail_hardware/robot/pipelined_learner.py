@@ -21,8 +21,8 @@ from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
-from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.checkpoint import entries_of
+from guiderail.tools.learning.episodes import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
