@@ -79,11 +79,7 @@ def format_verdicts(all_entries: list[Entry]) -> str:
     numbers = [number for entry in computed for number in entry.numbers]
     figures = [number for number in numbers if not number.startswith("table")]
     tables = [number.removeprefix("table ") for number in numbers if number.startswith("table")]
-    lines += (
-        ["", f"Without learning, figures {_enumerate(figures)} and tables {_enumerate(tables)} hold."]
-        if numbers
-        else []
-    )
+    lines += ["", f"Without learning, figures {_enumerate(figures)} and tables {_enumerate(tables)} hold."]
     return "\n".join([*lines, "", f"The stored training runs took {hours:.1f} core-hours.", ""])
 
 
