@@ -30,7 +30,7 @@ from research.results.methods import (
     task_table,
     training_safety,
 )  # fmt: skip
-from research.results.sections import SECTIONS
+from research.results.sections import ONLY_NAMED, SECTIONS
 from research.studies import study_names, study_path
 from research.thesis import describe_differences
 
@@ -48,7 +48,7 @@ PROGRAMS = {
         "worst_ratio_free", "worst_ratio_active", "worst_active",
     ),
     "smoothness": (
-        "method", "jerk_commanded_linear", "jerk_commanded_angular", "success_rate", "peak_force",
+        "method", "jerk_commanded_linear", "success_rate", "peak_force",
     ),
 }  # fmt: skip
 
@@ -190,8 +190,10 @@ def _program_section(name: str, rows: pd.DataFrame) -> str:
 
 def _studies_section(studies: Mapping[str, Study], stored: Mapping[str, pd.DataFrame]) -> str:
     """Return a table of the methods that the tables of all methods omit, and what was not run."""
-    cells = [row for name, study in studies.items() for row in _study_rows(study, stored[name])]
+    cells = [row for name in studies if name not in ONLY_NAMED for row in _study_rows(studies[name], stored[name])]
     lines = [_STUDIES, *([markdown_table(_STUDY_COLUMNS, cells), ""] if cells else [])]
+    if named := [f"`{name}`" for name in studies if name in ONLY_NAMED]:
+        lines += [f"Only in `research/results`: the other methods of {', '.join(named)}.", ""]
     for name, study in studies.items():
         if missing := _missing(study, stored[name]):
             lines.append(f"- `{name}`, not run: {'; '.join(missing)}")

@@ -63,6 +63,12 @@ _ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
 _NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
 _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
 
+# Studies that the pages only name: they repeat a method of a table, or a comparison in an earlier contact.
+ONLY_NAMED = (
+    "connector_disc_transfer", "connector_guidance", "connector_hard_fine_transfer", "connector_learners",
+    "grid_clamp_guidance",
+)  # fmt: skip
+
 SECTIONS: dict[str, list[Section]] = {
     "BncConnector": [
         Section(

@@ -20,7 +20,7 @@ from research.results.methods import (
     task_table,
 )
 from research.results.page import PAGES, write_pages
-from research.results.sections import BASELINES, NO_DEMONSTRATION, SECTIONS, Row, Section
+from research.results.sections import BASELINES, NO_DEMONSTRATION, ONLY_NAMED, SECTIONS, Row, Section
 from research.studies import study_path
 
 ROOT = Path(__file__).parents[3]
@@ -64,6 +64,14 @@ def test_rows_of_sections_name_methods_of_studies():
         assert row.method in study.methods, f"{row.study} has no {row.method}"
         assert row.eval_set is None or row.eval_set in [eval_set.name for eval_set in study.eval_set]
         assert row.eval_set is not None or len(study.eval_set) < 2, f"{row.study} has several evaluation sets"
+
+
+def test_page_names_studies_without_a_row():
+    page = (PAGES_FOLDER / "connector.md").read_text("utf-8")
+    for name in (name for name in ONLY_NAMED if name.startswith("connector")):
+        assert load_study(study_path(name)).task == "BncConnector"
+        assert f"`{name}`" in page.partition("Only in `research/results`")[2].partition(".")[0]
+        assert f"| `{name}` |" not in page
 
 
 def test_guided_methods_are_rows_of_their_section():

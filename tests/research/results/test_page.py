@@ -108,7 +108,7 @@ def test_smoothness_table_has_the_selected_columns(tmp_path):
     write_table(tmp_path / "study" / "smoothness", pd.DataFrame(rows))
     page = write_results([tmp_path / "study"], tmp_path / "results")
     assert "Place: connector; other places in the table: free." in page
-    assert "| KGRL |" + " 0.25 |" * 3 + " 3 |" in page
+    assert "| KGRL |" + " 0.25 |" * 2 + " 3 |" in page
     assert "gSDE" not in page
     assert "ldlj" not in page
 
