@@ -72,8 +72,8 @@ class AutoInterventionLearner(TqcLearner):
         """
         super().__init__(config, env, **arguments)
         self._env: Any = env.unwrapped
-        if config.pipelined or config.num_envs or self._env.diagram.config.reference() is None:
-            raise InputError("auto_intervention needs a task with demonstrations: leave out pipelined and num_envs")
+        if config.num_envs or self._env.diagram.config.reference() is None:
+            raise InputError("auto_intervention needs a task with demonstrations: leave out num_envs")
         self._reference = self._env.diagram.config.reference()
         self._start()
 

@@ -184,7 +184,7 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
         lambda p: p.selection_window > 0,
         "checkpoint selection among the run's actors",
     ),
-    ("pipelined", lambda p: p.pipelined, "the acting policy is one episode older than the learned one"),
+    ("num_envs", lambda p: p.num_envs > 0, "the acting policy is {num_envs} episodes older than the learned one"),
     ("actor_ema", lambda p: p.actor_ema > 0, "the policy is a moving average of actors"),
     ("layer_norm", lambda p: p.layer_norm, "layer normalization"),
     (

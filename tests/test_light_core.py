@@ -34,7 +34,6 @@ def test_primitive_and_templates_run_without_extras():
     import numpy as np
     from guiderail import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory, load_template
     from guiderail.models.common.transforms import RigidTransform
-    from guiderail.models.templates.validate import validate
 
     t = np.linspace(0.0, 1.0, 50)
     demonstrations = Demonstrations([t] * 3, [np.column_stack([np.sin(t), a * t]) for a in (0.9, 1.0, 1.1)])
@@ -53,7 +52,6 @@ def test_primitive_and_templates_run_without_extras():
         X_WE = template.command(state, X_WE, request, frames, 0.02).X_WE
         assert template.violation(state, X_WE, frames) <= 1e-9
         state = template.next_state(state, X_WE, frames, 0.02)
-    assert not [finding for finding in validate(template) if finding.is_error]
     print(not {"pydrake", "torch", "pandas"} & set(sys.modules))
     """)
     assert output.strip() == "True"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.envs.config import EnvConfig, prior_of, stations_of
@@ -26,12 +25,10 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry, find_plugins
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS, find_end_effector, find_robot
 from guiderail.tools.environments import task_options
-from guiderail.tools.files import path_exists
 from guiderail.tools.learning.learner import LEARNERS
 
 
@@ -225,50 +222,3 @@ def _format_value(value: Any) -> str:
 
 def _first_paragraph(entry: object) -> str:
     return str(entry.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").strip()
-
-
-_TEMPLATE_ENDINGS = (".yaml", ".yml")
-_SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a loaded transition distance, by the unit in the template file
-
-
-def describe_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """Validate a template and return its inputs, frames, states and transitions, with remarks.
-
-    With `draw`, its state machine is drawn to a .png, .svg, .pdf, .dot or .gv file.
-    """
-    from guiderail.models.templates import load_template
-    from guiderail.models.templates.drawing import draw as draw_template
-    from guiderail.models.templates.schema import shipped_templates
-    from guiderail.models.templates.validate import validate
-
-    if not path_exists(file) and str(file) not in shipped_templates():
-        raise InputError(
-            f"there is no file {file}: name a template (.yaml), or one of {', '.join(shipped_templates())}"
-        )
-    if path_exists(file) and file.suffix not in _TEMPLATE_ENDINGS:
-        raise InputError(f"{file} has the ending {file.suffix!r}: a template is .yaml")
-    template = load_template(file)
-    findings = validate(template)
-    errors = [finding.message for finding in findings if finding.is_error]
-    if errors:
-        raise InputError(f"{file}: " + "; ".join(message.rstrip(".") for message in errors))
-    if draw is not None:
-        draw_template(template, draw)
-    return {
-        "file": str(file),
-        "template": template.name,
-        "inputs": template.inputs,
-        "frames": list(template.frames),
-        "states": [state.name for state in template.states],
-        "transitions": [_describe_transition(s, t) for s in template.states for t in s.transitions],
-        "remarks": [finding.message for finding in findings if not finding.is_error],
-    }
-
-
-def _describe_transition(state: Any, transition: Any) -> str:
-    """Return a transition as text, with its unit and the threshold of the transition back."""
-    unit = _SI_UNITS[state.transition_distance.unit]
-    text = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
-    if transition.hysteresis is None:
-        return f"{text}, no way back"
-    return f"{text}, back above {transition.below + transition.hysteresis:g} {unit}"

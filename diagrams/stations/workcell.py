@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
+import numpy as np
 from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -14,7 +16,6 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 from pydrake.systems.framework import Context
 
 from guiderail.models.common.parsing import add_models
-from guiderail.models.objects.surfaces import Surface
 
 
 class Workcell(Protocol):
@@ -39,6 +40,51 @@ class Workcell(Protocol):
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Exclude contact between pairs of geometries, after the plant is finalized."""
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Cylinder about its z axis."""
+
+    radius: float  # [m]
+    length: float  # [m]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Box with edges along the axes of its frame."""
+
+    x: float  # [m]
+    y: float  # [m]
+    z: float  # [m]
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Convex hull of vertices (V, 3) [m]."""
+
+    vertices: np.ndarray
+
+
+@dataclass(frozen=True)
+class Spring:
+    """Spring-loaded prismatic joint of a surface: adds compliance where a physics engine's contact is too stiff."""
+
+    axis: tuple[float, float, float]  # direction of the joint (3,) in the body's frame
+    stiffness: float  # [N/m]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Convex solid of a body's collision geometry."""
+
+    name: str  # unique name
+    pair: str  # name of the pair; surfaces of two bodies collide if their pairs have the same name
+    shape: Cylinder | Box | Hull  # shape in the surface's frame
+    friction: float  # friction coefficient of the pair
+    position: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))  # position (3,) [m] of the frame in the body
+    pitch: float = 0.0  # rotation of the frame about the body's y axis [rad]
+    spring: Spring | None = None  # joint that carries the surface; None if the surface is fixed to the body
 
 
 @runtime_checkable

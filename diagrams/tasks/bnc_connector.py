@@ -49,12 +49,9 @@ from guiderail.models.objects.bnc_connector import (
     TOUCHING,
     BncDimensions,
     folder_of,
-    jack_surfaces,
-    plug_surfaces,
 )
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
-from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 
 # Smallest and largest offset of the jack [m].
@@ -186,14 +183,6 @@ class BncWorkcell(MovableWorkcell):
         depth, width, thickness = BOARD
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
         plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOR)
-
-    def fixture_surfaces(self) -> list[Surface]:
-        """Return the collision surfaces of the jack, in J."""
-        return jack_surfaces(self.dimensions, self.friction)
-
-    def workpiece_surfaces(self) -> list[Surface]:
-        """Return the collision surfaces of the plug, in its frame."""
-        return plug_surfaces(self.dimensions, self.friction)
 
     def locks(self, plug: np.ndarray) -> bool:
         """Return True if a plug is locked and on the jack's axis, given X_JPlug as position and rotation vector (6,).

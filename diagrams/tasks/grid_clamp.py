@@ -30,11 +30,8 @@ from guiderail.models.objects.grid_clamp import (
     FRICTION,
     TABLE_SDF,
     GridClampDimensions,
-    clamp_surfaces,
     folder_of,
-    table_surfaces,
 )
-from guiderail.models.objects.surfaces import Surface
 from guiderail.models.templates import load_template
 
 START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
@@ -101,14 +98,6 @@ class GridClampWorkcell(MovableWorkcell):
         """Add the table, and set the plant's stiction tolerance."""
         plant.set_stiction_tolerance(STICTION_TOLERANCE)
         super().add_fixture(plant)
-
-    def fixture_surfaces(self) -> list[Surface]:
-        """Return the collision surfaces of the table, in G."""
-        return table_surfaces(self.dimensions, self.friction)
-
-    def workpiece_surfaces(self) -> list[Surface]:
-        """Return the collision surfaces of the clamp, in its frame."""
-        return clamp_surfaces(self.dimensions, self.friction)
 
     def is_seated(self, clamp: np.ndarray) -> bool:
         """Return True if a clamp has snapped in, given X_GClamp as position and rotation vector (6,)."""

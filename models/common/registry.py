@@ -25,16 +25,19 @@ from guiderail.models.common.errors import InputError, brief, naming_failures
 
 GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
-    "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
+    "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor", "station:hardware"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "robustness", "converge", "certify", "report", "benchmark"),
-    "data": ("dataset",),
-    "lerobot": (),
-    "mujoco": (),
-    "cpp": (),
+    "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark"),
+    "data": ("dataset", "template"),
+    "lerobot": (
+        "learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy", "guidance:kgrl_base_policy",
+        "guidance:residual_base_policy",
+    ),
+    "mujoco": ("station:mujoco",),
+    "cpp": ("export",),
     "calibration": ("calibrate", "probe"),
-}
-"""Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""
+}  # fmt: skip
+"""Commands and named plug-ins of each sibling distribution guiderail-NAME, by NAME, for the line that installs it."""
 
 
 _DIAGRAMS, _LEARNING, _ROBOTS = "guiderail.diagrams", "guiderail.tools.learning", "guiderail.models.robots"
@@ -64,14 +67,12 @@ BUILT_IN = {
     "end_effector:parallel_gripper": f"{_ROBOTS}.catalog:PARALLEL_GRIPPER",
     "kernel:matern52": "guiderail.models.primitives.kernels:Matern52",
     "kernel:squared_exponential": "guiderail.models.primitives.kernels:SquaredExponential",
-    "learner:bc": f"{_LEARNING}.cloning:BcLearner",
     "learner:crossq": f"{_LEARNING}.off_policy:CrossQLearner",
     "learner:ppo": f"{_LEARNING}.on_policy:PpoLearner",
     "learner:sac": f"{_LEARNING}.off_policy:SacLearner",
     "learner:td3": f"{_LEARNING}.off_policy:Td3Learner",
     "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
     "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
-    "learner_config:bc": f"{_LEARNING}.learner_config:BcConfig",
     "learner_config:crossq": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:ppo": f"{_LEARNING}.learner_config:PpoConfig",
     "learner_config:sac": f"{_LEARNING}.learner_config:OffPolicyConfig",
@@ -223,6 +224,9 @@ class Registry(Generic[Entry]):
                     self._load(name, point)
             self._loaded.add(name)
         if name not in self._entries:
+            for sibling, provided in SIBLINGS.items():
+                if f"{self._plugin}:{name}" in provided:
+                    raise MissingSiblingError(f"the {self.noun} {name!r}", sibling)
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 

@@ -218,6 +218,7 @@ def axis_angle(R: RotationMatrix) -> tuple[np.ndarray, float]:
 
 
 POSE_NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+WRENCH_NAMES = ("Fx [N]", "Fy [N]", "Fz [N]", "Mx [Nm]", "My [Nm]", "Mz [Nm]")
 POSE_SIZE = 6
 """Number of coordinates of a pose."""
 

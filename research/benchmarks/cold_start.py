@@ -29,7 +29,7 @@ ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "fixtu
 EPISODES = 20  # with seeds 30 to 34, training has converged after at most 10 episodes
 SEEDS = range(400, 405)
 HELD_OUT = 100
-KINDS = {"alternating": "false", "pipelined": "true"}  # the setting `pipelined`
+KINDS = {"alternating": 0, "parallel": 1}  # the setting `num_envs`
 REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # largest accepted median and longest duration of a run [s]
 
 
@@ -69,10 +69,10 @@ def measure(
 
 
 def _train(
-    task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path, imports: Sequence[str]
+    task: str, options: Mapping[str, Any], episodes: int, seed: int, num_envs: int, out: Path, imports: Sequence[str]
 ) -> float:
     command = [sys.executable, "-m", "guiderail", "train", task, "--json"]
-    command += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
+    command += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"num_envs={num_envs}", "--out", str(out)]
     for name, value in options.items():
         command += ["--env", f"{name}={value}"]
     for module in imports:

@@ -5,8 +5,8 @@ from typing import Any
 
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring import make_template
-from guiderail.models.templates.drawing import draw, list_edges, state_lines
 from guiderail.tools.tables import write_table
+from guiderail_data.template_drawing import draw, list_edges, state_lines
 
 
 def figure_2_2(out: Path) -> dict[str, Any]:

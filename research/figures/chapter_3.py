@@ -11,12 +11,13 @@ from matplotlib.axes import Axes
 
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT, make_template
-from guiderail.models.templates.drawing import draw, state_lines
 from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.environments import make_environment
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.figures import draw_runs, legend, new_figure
+from guiderail.tools.visualization.figures import legend, new_figure
+from guiderail_data.template_drawing import draw, state_lines
 from guiderail_studies.job import Job
+from guiderail_studies.report import draw_runs
 from guiderail_studies.study import ratio, run_study
 from research.figures.runs import (
     episodes_of,

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.figures import color, draw_runs, label, legend, new_figure, save_figure
+from guiderail.tools.visualization.figures import color, label, legend, new_figure, save_figure
 from guiderail_studies.declaration import LearnerChoice, Method, Study, load_study
+from guiderail_studies.report import draw_runs
 from guiderail_studies.study import each
 from research.studies import study_path
 

@@ -65,6 +65,6 @@ def test_no_intervention_after_three_greedy_successes(passage, monkeypatch):
     assert run(passage, successes=3)[2]["auto_interventions"] == 0
 
 
-def test_interventions_are_refused_when_learner_is_pipelined(passage):
-    with pytest.raises(InputError, match="pipelined"):
-        run(passage, pipelined=True)
+def test_interventions_are_refused_with_parallel_actors(passage):
+    with pytest.raises(InputError, match="num_envs"):
+        run(passage, num_envs=1)

@@ -1,17 +1,12 @@
-"""Ensembles: mean action of several networks, their disagreement, and the command that writes them."""
+"""Ensembles: mean action of several networks, and their disagreement."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
 
-import guiderail
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Ensemble, Policy
-from guiderail.tools.cli.main import main
-from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.export import write_ensemble
 
 
 def policy(seed, size=3, **description):
@@ -46,26 +41,3 @@ def test_damaged_ensembles_are_refused(tmp_path):
         file.write_text(json.dumps(values | {"members": changed}))
         with pytest.raises(InputError, match="is damaged"):
             Policy.load(tmp_path)
-
-
-def test_ensemble_of_runs_is_evaluated_like_a_run(bead_run, tmp_path, capsys):
-    other, out = tmp_path / "other", tmp_path / "mean"
-    shutil.copytree(bead_run, other)
-    changed = Policy.load(other)
-    Policy([(weight + np.float32(0.1), bias) for weight, bias in changed.layers], changed.description).save(other)
-    with pytest.raises(SystemExit) as end:
-        main(["ensemble", str(bead_run), str(other), "--out", str(out), "--json"])
-    assert end.value.code == 0
-    assert json.loads(capsys.readouterr().out) == {"policy": str(out), "networks": 2}
-    evaluation = guiderail.evaluate(out, episodes=2, baselines=[], processes=1, steps=tmp_path / "steps")
-    assert evaluation["trained_episodes"] is None
-    steps = read_step_log(tmp_path / "steps")
-    assert len(steps) == evaluation.rows["policy"]["steps"].sum()
-    assert (steps["disagreement"] > 0.0).all()
-    assert "disagreement" not in read_step_log(bead_run / "steps")
-    with pytest.raises(InputError, match="already exists"):
-        guiderail.evaluate(out, episodes=2, baselines=[], steps=tmp_path / "steps")
-    with pytest.raises(InputError, match="name at least two"):
-        write_ensemble([bead_run], tmp_path / "one")
-    with pytest.raises(InputError, match="already exists"):
-        write_ensemble([bead_run, other], out)

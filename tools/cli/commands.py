@@ -1,4 +1,4 @@
-"""Commands of the core: train, evaluate, ensemble, export, visualize, template, list and demo."""
+"""Commands of the core: train, evaluate, visualize, list and demo."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,13 +12,11 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, check_task_name
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import MissingSiblingError, did_you_mean, find_plugins, load_plugin
+from guiderail.models.common.registry import did_you_mean, load_plugin
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 
 EPISODES = 20  # default number of episodes of an evaluation: about a minute with the baselines
-TARGETS = {"onnx": None, "cpp": "cpp"}
-"""Formats of `export`, and the sibling that has the plug-in `exporter:FORMAT`; the core writes ONNX itself."""
 
 
 @dataclass(frozen=True)
@@ -260,51 +258,6 @@ def _table_of(environments: Mapping[str, Mapping[str, float | None]]) -> Iterato
         yield "  ".join([f"{name:<{width}}", *(f"{text:<{cli.COLUMN}}" for text in cells)]).rstrip()
 
 
-@cli.command("ensemble runs/seed0 runs/seed1 runs/seed2 --out runs/mean")
-def ensemble(
-    runs: Annotated[list[str], argument("Folders of runs with the same observations and guidance.", "RUN...")],
-    out: Annotated[Path, option("Folder to write; it must not exist.")],
-    trust_imports: cli.TrustImports = False,
-    as_json: cli.Json = False,
-) -> None:
-    """Write the mean of several runs' policies as one policy.
-
-    The folder is evaluated like a run: guiderail evaluate runs/mean. The standard deviation of the networks' actions is
-    the column disagreement of the step log that evaluate --steps writes.
-    """
-    from guiderail.tools.export import write_ensemble
-
-    members = write_ensemble(runs, out).members
-    print_result({"policy": str(out), "networks": len(members)}, as_json)
-
-
-@cli.command("export pretrained:connector --target onnx --out connector")
-def export(
-    run: Annotated[str, argument("Folder of a run, or pretrained:NAME ({pretrained}).", "RUN", "pretrained")],
-    out: Annotated[Path, option("Folder to write; it must not exist.")],
-    target: Annotated[str, option(f"Format: {', '.join(TARGETS)}.")] = "onnx",
-    trust_imports: cli.TrustImports = False,
-) -> None:
-    """Write a skill to files that other programs read.
-
-    With onnx, the folder contains the policy (policy.onnx), the names, units, centers and scales of observation and
-    action in their order and the settings of the guidance (skill.json), and the data of its movement primitive
-    (primitive.npz). With cpp, it contains a C++ library that computes the commands, its data, and a test.
-    """
-    exporters = dict(find_plugins("exporter"))
-    if target not in TARGETS and target not in exporters:
-        raise InputError(f"there is no target {target!r}: {did_you_mean(target, [*TARGETS, *exporters])}")
-    if target in exporters:
-        export_skill = exporters[target].load()
-    elif (sibling := TARGETS[target]) is not None:
-        raise MissingSiblingError(f"guiderail export --target {target}", sibling)
-    else:
-        from guiderail.tools.export import export_skill
-
-    for path in export_skill(run, out):
-        typer.echo(path)
-
-
 @dataclass(frozen=True)
 class VisualizeOptions:
     """Files that visualize writes."""
@@ -376,23 +329,6 @@ def visualize(
         if path is not None:
             write(path, episode)
             typer.echo(path)
-
-
-template = cli.command_group("template", "Validate shared control templates.")
-
-
-@cli.command("template validate pouring --draw pouring.svg", "validate", template)
-def validate_template(
-    file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
-    draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
-    imports: cli.TemplateImports = None,
-    as_json: cli.Json = False,
-) -> None:
-    """Validate and summarize a shared control template before it is used."""
-    from guiderail.tools.catalog import describe_template
-
-    cli.import_files(imports)
-    print_result(describe_template(file, draw), as_json)
 
 
 @cli.command("list BncConnector", "list")

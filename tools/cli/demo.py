@@ -43,8 +43,8 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."
     )
     write_atomically(out / MARK, b"")
-    pipelined = {"pipelined": True}
-    run = train("NarrowPassage", "skgrl", out=out, preset=PRESET, settings=pipelined, episodes=episodes, seed=seed)
+    learner = {"num_envs": 1}  # simulates in a second process while this one learns
+    run = train("NarrowPassage", "skgrl", out=out, preset=PRESET, settings=learner, episodes=episodes, seed=seed)
     before, after = _evaluate(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()

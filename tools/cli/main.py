@@ -17,7 +17,7 @@ from guiderail.models.common.registry import SIBLINGS, MissingSiblingError, did_
 from guiderail.tools.cli.app import app, print_message
 from guiderail.tools.terminal import protect_terminal
 
-COMMANDS = ("train", "demo", "evaluate", "ensemble", "visualize", "template", "list", "export")
+COMMANDS = ("train", "demo", "evaluate", "visualize", "list")
 """Names of the commands that `guiderail.tools.cli.commands` registers."""
 ENVIRONMENT_OPTIONS = (
     "--guidance", "--station", "--difficulty", "--reward", "--observation", "--action-repeat", "--fixture-offset",

@@ -23,7 +23,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, reports_success
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
+from guiderail.tools.learning.run_folder import RunConfig, installed_versions
 from guiderail.tools.tables import read_table, table_text
 
 POLICY = "policy"  # name of the evaluated policy
@@ -85,23 +85,6 @@ def policy_digest(source: Path) -> str:
     if not file.is_file():
         return str(time.time_ns())
     return hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
-
-
-def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the name of each policy and its stored episodes in the run's own environment, with `seed` as first seed."""
-    digest = policy_digest(folder.path)
-    for file in sorted(
-        path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
-    ):
-        name, rows = file.stem.rpartition("-")[0], read_table(file)
-        kwargs = {"episodes": len(rows), "seed": seed}
-        # `about` of a baseline policy is None if it was given by name, and its name if it was given as a function.
-        abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)
-        if _can_name_file(name) and any(
-            file == episodes_file(file.parent, name, config, config.environment, about=about, **kwargs)
-            for about in abouts
-        ):
-            yield name, rows
 
 
 COMPARED = (

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from numbers import Number
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,20 +29,17 @@ from guiderail.tools.learning.environment_set import (
     select_environment,
     trained_set,
 )
-from guiderail.tools.learning.episodes import Demonstrator, Episodes, Supervise
+from guiderail.tools.learning.episodes import ActorEpisodes, Demonstrator, Episodes, Sb3Callbacks, Supervise
 from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
     LearningLog,
-    describe_interface,
+    describe_policy,
     divergence_error,
     learner_arguments,
 )
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
-
-if TYPE_CHECKING:
-    from guiderail.tools.learning.episodes import Sb3Callbacks
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -101,7 +98,10 @@ def run_training(
             episodes = Episodes(config, make_run_environment(config), demonstrator)
         stack.callback(lambda: episodes.close())
         env = episodes.env
-        if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
+        number = config.learner.demonstration_episodes
+        if demonstrator is not None and config.learner.demonstrator:
+            demonstrator(env)  # raises an InputError that names the difference
+        elif demonstrator is not None and number and not is_compatible(demonstrator, env):
             raise InputError(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
@@ -125,21 +125,11 @@ def run_training(
         closed_first.callback(learning_log.close)
         callbacks = None
         if observers.sb3_callbacks is not None:
-            from guiderail.tools.learning.episodes import Sb3Callbacks
-
-            if config.learner.pipelined or config.learner.num_envs:
-                raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
+            if config.learner.num_envs:
+                raise InputError("callbacks need the episodes in this process: leave num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
-        if config.learner.pipelined:
-            from guiderail.tools.learning.networks import SpacesOnlyEnv
-            from guiderail.tools.learning.processes import PipelinedLearner
-
-            child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
-            learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
-        elif config.learner.num_envs:
-            from guiderail.tools.learning.processes import ActorEpisodes
-
+        if config.learner.num_envs:
             episodes = ActorEpisodes(episodes, learner)
             closed_first.callback(episodes.end)
         stack.enter_context(closed_first.pop_all())  # the lock is released last: all of these write into the folder
@@ -161,10 +151,8 @@ def run_training(
 
 def _check_combination(config: RunConfig, *, has_demonstrator: bool, is_supervised: bool) -> None:
     """Raise an InputError if settings are incompatible, or a demonstrator or a supervisor is missing."""
-    if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
-        raise InputError(
-            "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
-        )
+    if config.learner.num_envs and config.human_in_the_loop:
+        raise InputError("num_envs does not work with --human-in-the-loop: leave one of them out")
     if config.human_in_the_loop and config.members:
         raise InputError("a supervisor corrects one environment: leave --human-in-the-loop out, or name one task")
     if config.human_in_the_loop and not is_supervised:
@@ -349,7 +337,7 @@ class TrainingLoop:
         config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
         try:
             with _naming_failures(config, name, ValueError):
-                policy = self._learner.policy({"task": config.task, **describe_interface(self._episodes.env)})
+                policy = self._learner.policy(describe_policy(config, self._episodes.env))
         except InputError:
             raise
         except ValueError as error:

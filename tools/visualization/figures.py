@@ -1,7 +1,7 @@
 """Figures: one color for each guidance, without a window; curves of a run, and the narrow passage."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -58,32 +58,6 @@ def save_figure(figure: Figure, path: Path) -> Path:
 def rolling(values: Sequence[float] | np.ndarray, window: int = WINDOW) -> np.ndarray:
     """Return the moving mean (n,) of the last `window` of the values (n,), or of fewer values at the start."""
     return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
-
-
-def draw_runs(
-    axis: Axes,
-    runs: Sequence[Sequence[float] | np.ndarray],
-    *,
-    window: int = WINDOW,
-    band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = lambda values: (values.min(0), values.max(0)),
-    **line: Any,
-) -> None:
-    """Draw the learning curve of a method: the mean over runs of a moving mean, and a band.
-
-    Args:
-        axis: Axes.
-        runs: Values over the episodes of each run, at least one run; longer runs are cut to the shortest.
-        window: Episodes of the moving mean.
-        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each; by default the
-            range of the runs.
-        line: Arguments of the line, such as `color`, which the band has too, and `label`.
-    """
-    length = min(len(run) for run in runs)
-    smooth = np.stack([rolling(run, window)[:length] for run in runs])
-    episodes = np.arange(1, length + 1)
-    if len(runs) > 1:
-        axis.fill_between(episodes, *band(smooth), color=line.get("color"), alpha=0.15, linewidth=0)
-    axis.plot(episodes, smooth.mean(axis=0), **line)
 
 
 def legend(figure: Figure, axis: Axes) -> None:

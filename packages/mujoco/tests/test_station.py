@@ -19,6 +19,7 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from guiderail_mujoco.station import MujocoContact, MujocoStation, constraint_torques, mujoco_parts
+from guiderail_mujoco.surfaces import surfaces_of
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
 STIFFNESS = Impedance().stiffness[2]  # [N/m]
@@ -290,7 +291,7 @@ def test_station_raises_when_mujoco_is_missing(monkeypatch):
 
 
 def test_parts_with_more_pairs_than_mask_bits_are_refused():
-    surface = CONNECTOR.fixture_surfaces()[0]
+    surface = surfaces_of(CONNECTOR)[0][0]
     fixture = [replace(surface, name=f"surface_{i}", pair=f"pair_{i}") for i in range(31)]
     mujoco_parts(fixture[:30], [], MujocoContact())
     with pytest.raises(InputError, match="at most 30 pairs of surfaces, and the workcell has 31"):

@@ -15,8 +15,10 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, read_step_log
@@ -24,8 +26,8 @@ from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.figures import new_figure, plot_run
-from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, write_report
-from guiderail_studies.report_data import command, gather
+from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, draw_runs, write_report
+from guiderail_studies.report_data import _stored_episodes, command, gather
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
 
@@ -328,3 +330,25 @@ def test_report_refuses_a_table_with_missing_rows(study_folder, tmp_path):
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
     with pytest.raises(InputError, match=f"{table} has 2 of the 3 episodes of its checkpoint: resume the run"):
         gather([tmp_path])
+
+
+def test_draw_runs_draws_the_mean_and_a_band_of_runs():
+    _, axes = new_figure(1, 2, (4.0, 3.0))
+    runs = [np.array([0.0, 2.0, 4.0]), np.array([2.0, 2.0])]
+    draw_runs(axes[0, 0], runs, color="C0", label="two", window=1)
+    draw_runs(axes[0, 1], runs[:1], color="C0", label="one", window=1)
+    np.testing.assert_array_equal(axes[0, 0].lines[0].get_ydata(), [1.0, 2.0])
+    assert [len(axis.collections) for axis in axes.flat] == [1, 0]
+
+
+def test_stored_episodes_belong_to_the_policy_of_the_run(bead_run):
+    folder = RunFolder(bead_run)
+    evaluate(bead_run, episodes=2, baselines=["constant"])
+    evaluate(bead_run, episodes=2, environment={"wall": -0.5})
+    pd.DataFrame({"success": [1]}).to_csv(bead_run / "baselines" / "other.csv", index=False)
+    stored = dict(_stored_episodes(folder, folder.config(), HELD_OUT_SEED))
+    assert {name: len(rows) for name, rows in stored.items()} == {"policy": 2, "demonstration": 2, "constant": 2}
+    policy = Policy.load(bead_run)
+    policy._layers[0][0][0, 0] += 0.1
+    policy.save(bead_run)
+    assert "policy" not in dict(_stored_episodes(folder, folder.config(), HELD_OUT_SEED))

@@ -535,10 +535,10 @@ def test_invalid_study_is_refused_and_writes_nothing(changed, message, tmp_path)
 
 
 def test_null_preset_of_a_method_removes_the_preset(tmp_path):
-    methods = {"sac": {}, "bc": {"learner": {"algorithm": "bc", "preset": None}}}
+    methods = {"sac": {}, "ppo": {"learner": {"algorithm": "ppo", "preset": None}}}
     declaration = {"name": "clamp", "task": "GridClamp", "methods": methods, "seeds": [0], "after_episodes": [5]}
     study = Study.model_validate(declaration | {"learner": {"algorithm": "sac", "preset": "sac_gridclamp"}})
-    assert [Job(study, name, 0, tmp_path).config(5).learner.algorithm for name in methods] == ["sac", "bc"]
+    assert [Job(study, name, 0, tmp_path).config(5).learner.algorithm for name in methods] == ["sac", "ppo"]
 
 
 def test_after_episodes_are_limited_to_the_training_length():

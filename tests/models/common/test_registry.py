@@ -10,8 +10,9 @@ import guiderail
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, register_task
+from guiderail.models.common import registry as registry_module
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import BUILT_IN, Registry
+from guiderail.models.common.registry import BUILT_IN, SIBLINGS, Registry, find_plugins
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS
 from guiderail.tools.learning.learner import LEARNERS
@@ -29,6 +30,17 @@ def test_get_refuses_names_that_are_not_text(name):
     shapes.register("sphere", object())
     with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
         shapes.get(name)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sibling"), [(name, sibling) for sibling, names in SIBLINGS.items() for name in names if ":" in name]
+)
+def test_plugin_of_missing_sibling_names_the_line_that_installs_it(entry, sibling, monkeypatch):
+    kind, _, name = entry.partition(":")
+    assert name in dict(find_plugins(kind))
+    monkeypatch.setattr(registry_module, "find_plugins", lambda kind: iter(()))
+    with pytest.raises(InputError, match=rf"the {kind} '{name}' needs .*: pip install \"guiderail\[{sibling}\]\""):
+        Registry(kind, plugin=kind).get(name)
 
 
 @pytest.mark.parametrize("task", [5, None, ["NarrowPassage"]])

@@ -24,7 +24,7 @@ def test_measure_times_both_kinds_for_each_seed(monkeypatch, bead_config, capsys
     result = cold_start.measure("Bead", None, ("bead",), episodes=1, seeds=range(2, 4), held_out=3)
     kinds = list(cold_start.KINDS)
     assert [(run["seed"], run["kind"]) for run in result["runs"]] == [(s, k) for s in (2, 3) for k in kinds]
-    assert settings == ["pipelined=false", "pipelined=true"] * 2
+    assert settings == ["num_envs=0", "num_envs=1"] * 2
     assert all(run["seconds"] > 0.0 and 0.0 <= run["success_rate"] <= 1.0 for run in result["runs"])
     cold_start.show(result)
     assert "seed 3" in capsys.readouterr().out

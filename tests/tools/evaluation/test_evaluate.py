@@ -12,7 +12,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluate import _save_demonstrations, evaluate, evaluate_policy
-from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, stored_episodes
+from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute
 from guiderail.tools.evaluation.subject import evaluation_scope, outcome, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import Run
@@ -139,19 +139,6 @@ def test_failure_of_a_given_baseline_is_named(make_policy, name, num_stored, bea
     with pytest.raises(InputError, match=message):
         evaluate(bead_run, episodes=2, baselines={"zero": zero_policy, "lab": make_policy}, processes=1)
     assert len(list(bead_run.glob("baselines/zero-*.csv"))) == num_stored
-
-
-def test_stored_episodes_belong_to_the_policy_of_the_run(bead_run):
-    folder = RunFolder(bead_run)
-    evaluate(bead_run, episodes=2, baselines=["constant"])
-    evaluate(bead_run, episodes=2, environment={"wall": -0.5})
-    pd.DataFrame({"success": [1]}).to_csv(bead_run / "baselines" / "other.csv", index=False)
-    stored = dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
-    assert {name: len(rows) for name, rows in stored.items()} == {"policy": 2, "demonstration": 2, "constant": 2}
-    policy = Policy.load(bead_run)
-    policy._layers[0][0][0, 0] += 0.1
-    policy.save(bead_run)
-    assert "policy" not in dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
 
 
 def test_evaluate_accepts_a_policy_without_a_run(bead_run, tmp_path):

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.processes import ActorEpisodes
+from guiderail.tools.learning.episodes import ActorEpisodes
 from guiderail.tools.learning.run_folder import LOCK, RunFolder
 from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.same_runs import differences
@@ -105,9 +105,9 @@ def test_diverged_run_with_actors_is_reported(parallel_config, tmp_path):
 
 def test_actors_are_refused_with_conflicting_settings(parallel_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    with pytest.raises(InputError, match="num_envs does not work with"):
-        run_training(folder, parallel_config(2, pipelined=True))
-    with pytest.raises(InputError, match="callbacks need model and episodes"):
+    with pytest.raises(InputError, match="num_envs does not work with --human"):
+        run_training(folder, replace(parallel_config(2), human_in_the_loop=True))
+    with pytest.raises(InputError, match="callbacks need the episodes"):
         run_training(folder, parallel_config(2), observers=Observers(sb3_callbacks=[]))
     assert not folder.path.exists()
 

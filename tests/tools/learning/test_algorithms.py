@@ -1,4 +1,4 @@
-"""TD3, CrossQ, PPO, TRPO and behavior cloning; demonstrations in every batch; dropout of the critics."""
+"""TD3, CrossQ, PPO and TRPO; demonstrations in every batch; dropout of the critics."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -171,13 +171,13 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
     ("settings", "message"),
     [
         ({"demonstration_fraction": 0.5}, "needs demonstrations: give --set demonstration_episodes"),
-        ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
+        ({"demonstrator": "runs/a"}, "demonstrator acts in the demonstrations: give --set demonstration_episodes"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
         *(
             ({"algorithm": "ppo", name: 1}, f"ppo has no setting '{name}'")
-            for name in ("demonstration_episodes", "symmetry", "pipelined", "num_envs")
+            for name in ("demonstration_episodes", "symmetry", "num_envs")
         ),
     ],
 )
@@ -217,53 +217,9 @@ def test_configuration_is_restored_from_its_values():
     assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")
 
 
-def demonstrator_action(observation):
-    return np.array([0.5 * observation[0], -0.8 * observation[1] * observation[2]], np.float32)
-
-
-def record_demonstrations(learner, episodes, rng, length=20):
-    for _ in range(episodes):
-        learner.on_episode_start()
-        for step in range(length):
-            observation, next_observation = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
-            action, is_last = demonstrator_action(observation), step == length - 1
-            learner.on_step(Transition(observation, action, 0.0, next_observation, False, is_last, {}))
-        learner.on_episode_end({"success": 1})
-
-
-def test_behavior_cloning_acts_as_the_demonstrator():
-    config = make_config("bc", {"demonstration_episodes": 4, "gradient_steps": 400, "net_arch": "32,32"})
-    learner = make(config)
-    rng = np.random.default_rng(0)
-    record_demonstrations(learner, 3, rng)
-    with pytest.raises(InputError, match="bc trains after 4 demonstrations: give at least that many --episodes"):
-        learner.policy({})
-    arrays, values = learner.state()
-    arrays = {key: value.copy() for key, value in arrays.items()}
-    record_demonstrations(learner, 1, np.random.default_rng(5))
-    record_demonstrations(learner, 1, rng)  # no effect: bc learns from the first four episodes only
-    observations = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
-    policy = learner.policy({"observation_shape": [3]})
-    errors = [policy(observation) - demonstrator_action(observation) for observation in observations]
-    assert np.sqrt(np.mean(np.square(errors))) < 0.1
-    np.testing.assert_allclose(learner.act(observations[0]), policy(observations[0]), atol=1e-6)
-    assert learner.metrics()["train/loss"] < 0.02
-    assert learner.metrics() == {}
-    restored = make(config)
-    restored.restore(arrays, values)
-    record_demonstrations(restored, 1, np.random.default_rng(5))
-    np.testing.assert_array_equal(restored.act(observations[1]), learner.act(observations[1]))
-
-
-def test_behavior_cloning_refuses_zero_demonstrations():
-    assert make_config("bc", {"demonstration_episodes": 1}).demonstration_episodes == 1
-    with pytest.raises(InputError, match="learns from demonstrations"):
-        make_config("bc", {"demonstration_episodes": 0})
-
-
-@pytest.mark.parametrize("algorithm", ["bc", "ppo", "trpo", "chunk"])
+@pytest.mark.parametrize("algorithm", ["ppo", "trpo"])
 def test_images_are_refused_by_learners_without_image_encoder(algorithm):
-    learner = make_config(algorithm, {"demonstration_episodes": 1} if algorithm in ("bc", "chunk") else {})
+    learner = make_config(algorithm, {})
     task = SimpleNamespace(observation_space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
     with pytest.raises(InputError, match=f"{algorithm} takes no images"):
         learner_arguments(SimpleNamespace(learner=learner), task)

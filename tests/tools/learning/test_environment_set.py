@@ -38,8 +38,8 @@ def stop_in_episode_2(row):
         raise Stopped
 
 
-@pytest.mark.parametrize("settings", [{}, {"num_envs": 2}, {"pipelined": True}])
-def test_run_over_a_set_resumes_bit_for_bit(settings, tmp_path, forkserver):
+@pytest.mark.parametrize("settings", [{}, {"num_envs": 2}])
+def test_run_over_a_set_resumes_bit_for_bit(settings, tmp_path):
     config = configuration(**settings)
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)

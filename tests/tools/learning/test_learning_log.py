@@ -44,12 +44,6 @@ def test_log_does_not_change_the_run(bead_config, tmp_path):
     assert differences(tmp_path / "silent", tmp_path / "logged") == []
 
 
-def test_pipelined_learner_logs_losses_of_its_process(bead_config, tmp_path, forkserver):
-    learner = replace(bead_config.learner, pipelined=True, constant_episodes=0)
-    run_training(RunFolder(tmp_path), replace(bead_config, learner=learner), observers=Observers(log="csv"))
-    assert pd.read_csv(tmp_path / "logs" / "progress.csv")[LOSSES].iloc[-1].notna().all()
-
-
 def test_resumed_run_keeps_the_log_of_its_first_part(bead_config, tmp_path):
     run_training(RunFolder(tmp_path), replace(bead_config, episodes=2), observers=Observers(log=["csv"]))
     run_training(RunFolder(tmp_path), replace(bead_config, episodes=4), resume=True, observers=Observers(log=["csv"]))

@@ -16,9 +16,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.learner_config import resolve_preset
-from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
-from guiderail.tools.learning.processes import PipelinedLearner
 
 OBSERVED, HIDDEN = 5, 3
 SETTINGS = {"net_arch": "16", "batch_size": 8, "learning_starts": 4, "symmetry": False, "privileged_critic": True}
@@ -155,38 +153,3 @@ def test_rollout_passes_hidden_values_to_callbacks_only():
     assert all(transition.privileged.shape == (9,) for transition in transitions)
     np.testing.assert_array_equal(transitions[0].next_privileged, transitions[1].privileged)
     assert not np.array_equal(transitions[0].privileged, transitions[-1].next_privileged)
-
-
-def test_pipelined_learner_restores_a_pending_episode():
-    """The pending episode of a checkpoint contains the hidden values."""
-
-    def pipelined():
-        config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"train_freq": 1, "gradient_steps": 1})
-        options = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
-        env = SpacesOnlyEnv(Vector())
-        return PipelinedLearner(TqcLearner(config, env, **options), ((config, env), options), waits=True)
-
-    def run_episode(learner, seed):
-        random = np.random.default_rng(seed)
-        learner.on_episode_start()
-        for _ in range(8):
-            observation = random.uniform(-1, 1, OBSERVED).astype(np.float32)
-            hidden = random.uniform(-1, 1, HIDDEN).astype(np.float32)
-            action = learner.act(observation)
-            learner.on_step(Transition(observation, action, 1.0, observation, False, False, {}, hidden, hidden))
-        learner.on_episode_end({"termination": "success", "success": True})
-
-    whole, resumed = pipelined(), pipelined()
-    run_episode(whole, 0)
-    arrays, values = whole.state()
-    assert arrays["pending/privileged"].shape == (8, HIDDEN)
-    random_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
-    whole.submit_episode()
-    whole.finish()
-    torch.set_rng_state(random_state[0])
-    np.random.set_state(random_state[1])  # noqa: NPY002
-    resumed.restore(arrays, values)
-    resumed.finish()
-    observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
-    policies = [learner.policy({"observation_shape": [OBSERVED]}) for learner in (whole, resumed)]
-    np.testing.assert_array_equal(policies[0](observation), policies[1](observation))

@@ -13,7 +13,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
-from guiderail.tools.learning import episodes, processes, trainer
+from guiderail.tools.learning import episodes, trainer
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import SacLearner
 from guiderail.tools.learning.run_folder import RunFolder, configure, resumed_config
@@ -106,6 +106,25 @@ def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_policy_of_a_run_demonstrates(bead_config, bead_run, tmp_path):
+    config = with_demonstrations(bead_config, 2)
+    config = replace(config, learner=replace(config.learner, demonstrator=str(bead_run)))
+    env, policy = trainer.make_run_environment(config), Policy.load(bead_run)
+    observation, _ = env.reset(seed=0)
+    demonstrator = episodes.make_demonstrator(config)
+    np.testing.assert_array_equal(demonstrator(env)(observation), policy(observation))
+    rows = run_training(RunFolder(tmp_path / "demonstrated"), config, demonstrator=demonstrator)
+    assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
+
+
+def test_demonstrating_run_of_another_environment_is_refused_by_the_difference(bead_config, bead_run, tmp_path):
+    config = with_demonstrations(bead_config, 1)
+    config = replace(config, learner=replace(config.learner, demonstrator="pretrained:passage"))
+    with pytest.raises(InputError, match=r"the policy takes observations .* and this environment has observations"):
+        run_training(RunFolder(tmp_path / "demonstrated"), config, demonstrator=episodes.make_demonstrator(config))
+    assert not (tmp_path / "demonstrated").exists()
+
+
 def test_killed_run_resumes_bit_for_bit(bead_config, bead_run, forkserver, tmp_path):
     killed = RunFolder(tmp_path / "killed")
     receiver, sender = FORKS.Pipe(duplex=False)
@@ -137,9 +156,9 @@ def test_finished_run_continues_with_more_episodes(bead_config, bead_run, tmp_pa
     assert extended.config() == bead_config
 
 
-@pytest.mark.parametrize("changes", [{}, {"pipelined": True, "constant_episodes": 0}, {"num_envs": 2}], ids=str)
+@pytest.mark.parametrize("changes", [{}, {"num_envs": 2}], ids=str)
 @pytest.mark.parametrize("episodes", [4, 6])
-def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_config, tmp_path, monkeypatch, forkserver):
+def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_config, tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.tools.learning.trainer.MAX_SAVING_FRACTION", np.inf)  # a checkpoint per episode
     config = replace(bead_config, learner=replace(bead_config.learner, **changes))
     short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")
@@ -165,8 +184,7 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
     def rollout_with_success(*arguments, index, **options):
         return rollout(*arguments, index=index, **options) | {"success": successes[index]}
 
-    for module in (episodes, processes):
-        monkeypatch.setattr(module, "rollout", rollout_with_success)
+    monkeypatch.setattr(episodes, "rollout", rollout_with_success)
     learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
     config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
     run_training(whole, config)
@@ -203,20 +221,6 @@ def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     before = Policy.load(folder.path).description
     run_training(folder, replace(bead_config, episodes=3), resume=True)
     assert Policy.load(folder.path).description == before, "the policy of a finished run is replaced"
-
-
-def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
-    """The episode that is pending when the run stops is learned from after the resume."""
-    plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
-    config = replace(plain, learner=replace(plain.learner, pipelined=True))
-    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
-    rows = run_training(undisturbed, config)
-    with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, observers=Observers(interrupt_in(4)))
-    run_training(stopped, config, resume=True)
-    assert_same_run(undisturbed, stopped)
-    # A run that is not pipelined acts with weights that are one episode newer.
-    assert without_clock(rows) != without_clock(run_training(RunFolder(tmp_path / "plain"), plain))
 
 
 def test_run_is_locked_against_other_processes(bead_config, forkserver, tmp_path):
@@ -356,9 +360,8 @@ def test_chosen_algorithm_replaces_the_default_learner():
     assert configure("GridClamp", {"guidance": "none"}, algorithm="tqc").preset == "tqc_contact"
 
 
-@pytest.mark.parametrize("pipelined", [False, True])
-def test_diverged_run_is_reported_and_its_folder_is_kept(pipelined, bead_config, tmp_path, forkserver):
-    learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
+def test_diverged_run_is_reported_and_its_folder_is_kept(bead_config, tmp_path):
+    learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(InputError, match="diverged"):
         run_training(folder, replace(bead_config, learner=learner))
@@ -408,17 +411,6 @@ def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
         train(out=out, episodes=2, resume=True)
     assert episodes_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
-
-
-def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
-    monkeypatch.setitem(LEARNERS._entries, "lab_sac", None)  # removed after the test
-    names = "off_policy.SacLearner", "learner.register_learner"
-    file = write_subclass(tmp_path, "guiderail.tools.learning", *names, "lab_sac")
-    settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
-    environment, choices = {"guidance": "kgrl", "action_repeat": 20}, {"algorithm": "lab_sac", "episodes": 2}
-    training = Training(tmp_path / "run", ["NarrowPassage"], environment, choices | {"settings": settings})
-    run = replace(training, imports=[str(file)], pictures=False).start()
-    assert run.summary["episodes"] == 2
 
 
 @pytest.fixture

@@ -22,9 +22,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
-from guiderail.tools.export import GUIDED, Exporter, TrainedSkill, to_json
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
 from guiderail_cpp.recording import record_skill
+from guiderail_cpp.skill import GUIDED, Exporter, TrainedSkill, to_json
 from guiderail_cpp.templates import template_arrays
 
 EXPORTED = {"history.adaptive": False}
@@ -52,7 +52,7 @@ def _project_files(skill: TrainedSkill) -> dict[str, bytes]:
 
 
 export_cpp = Exporter((*GUIDED, *TEMPLATES), EXPORTED, _project_files)
-"""Write the skill of a run as a C++ project; a call has the arguments of `guiderail.tools.export.Exporter`."""
+"""Write the skill of a run as a C++ project; a call has the arguments of `guiderail_cpp.skill.Exporter`."""
 
 
 def _copied(folder: Traversable, prefix: str) -> dict[str, bytes]:

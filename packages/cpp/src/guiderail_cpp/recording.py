@@ -15,8 +15,8 @@ from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import ContactPointMean, center_of_pressure
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
-from guiderail.tools.export import TrainedSkill
 from guiderail_cpp.arrays import Arrays
+from guiderail_cpp.skill import TrainedSkill
 
 Entries = Sequence[Mapping[str, Any]]
 """Entries of an observation, as in `skill.json`."""

@@ -1,4 +1,4 @@
-"""`guiderail dataset`."""
+"""`guiderail dataset` and `guiderail template`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +7,7 @@ from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
 
 dataset = cli.command_group("dataset", "Import, export and validate demonstrations, and fit bounds to them.")
+template = cli.command_group("template", "Validate shared control templates.")
 
 POSE = "x,y,z,rx,ry,rz"
 
@@ -128,3 +129,17 @@ def fit_bounds(
         task=task,
     )
     print_result(result, as_json)
+
+
+@command("template validate pouring --draw pouring.svg", "validate", template)
+def validate_template(
+    file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
+    draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
+    imports: cli.TemplateImports = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Validate and summarize a shared control template before it is used."""
+    from guiderail_data.template_validation import describe_template
+
+    cli.import_files(imports)
+    print_result(describe_template(file, draw), as_json)

@@ -13,13 +13,12 @@ import numpy as np
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError, brief, import_extra
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.common.transforms import POSE_NAMES
+from guiderail.models.common.transforms import POSE_NAMES, WRENCH_NAMES
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.episode import Callback, EnvCallback, Transition
 from guiderail.tools.evaluation.evaluate import check_num_episodes
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import find_subject
-from guiderail.tools.export import WRENCH_NAMES
 from guiderail.tools.files import check_new
 from guiderail_data.formats.lerobot import Feature, write_features
 

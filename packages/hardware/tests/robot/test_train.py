@@ -24,13 +24,13 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.processes import PipelinedLearner
 from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.models.joint_status import Fault, JointStatus
 from guiderail_hardware.robot import preflight
 from guiderail_hardware.robot.connection import RobotConnection
 from guiderail_hardware.robot.operator import OperatorKeys
+from guiderail_hardware.robot.pipelined_learner import PipelinedLearner
 from guiderail_hardware.robot.preflight import SPEED
 from guiderail_hardware.robot.robot_env import RobotEnv
 from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot

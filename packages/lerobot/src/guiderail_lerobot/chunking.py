@@ -15,8 +15,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.cloning import BcLearner
 from guiderail.tools.learning.learner import register_learner
+from guiderail_lerobot.cloning import BcLearner
 from guiderail_lerobot.config import ChunkConfig
 
 MIN_SCALE = 1e-6  # minimum scale of an output; the standard deviation of a constant output is zero

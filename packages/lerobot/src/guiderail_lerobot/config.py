@@ -1,13 +1,33 @@
-"""Settings of the learners of base policies."""
+"""Settings of the learners from demonstrations and from a teacher."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.learner import NonNegative, Positive
-from guiderail.tools.learning.learner_config import BatchSize, BcConfig, Fraction, NetArch, Noise
+from guiderail.tools.learning.learner import LearnerConfig, NonNegative, Positive, Symmetries
+from guiderail.tools.learning.learner_config import BatchSize, Fraction, NetArch, Noise, Rate, RunName
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class BcConfig(LearnerConfig):
+    """Settings of behavior cloning (BC)."""
+
+    takes_images: ClassVar[bool] = False
+
+    algorithm: str = "bc"
+    demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
+    demonstrator: RunName = ""  # run or pretrained:NAME whose policy demonstrates; default: the scripted policy
+    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
+    learning_rate: Rate = 1e-3
+    gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration
+    batch_size: BatchSize = 64  # transitions
+    net_arch: NetArch = (256, 256)  # units of the hidden layers
+
+    def __post_init__(self) -> None:
+        if not self.demonstration_episodes:
+            raise InputError("bc learns from demonstrations: give --set demonstration_episodes=... of at least 1")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -25,12 +25,12 @@ from guiderail.diagrams.stations.station import (
     check_pose,
     exact_periods,
 )
-from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
+from guiderail.diagrams.stations.workcell import Cylinder, Hull, Surface, Workcell
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
 from guiderail_mujoco.gantry import MovedBodies, MujocoGantry
+from guiderail_mujoco.surfaces import surfaces_of
 
 if TYPE_CHECKING:
     import mujoco
@@ -222,17 +222,12 @@ class MujocoStation(Station):
         time_step = PLANT_PERIOD if time_step is None else time_step
         control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
-        if not isinstance(workcell, ConvexWorkcell):
-            raise InputError(
-                f"station='mujoco' needs convex solids, which {type(workcell).__name__} does not provide: "
-                "implement the methods of ConvexWorkcell"
-            )
+        surfaces = surfaces_of(workcell)
         builder = DiagramBuilder()
         self.scene_graph = builder.AddSystem(SceneGraph())
         self.plant = plant = builder.AddNamedSystem("plant", MultibodyPlant(0.0))
         moved = _add_workcell(plant, self.scene_graph, workcell)
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
-        surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
         self._time_step = time_step
         self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)

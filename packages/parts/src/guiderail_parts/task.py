@@ -22,7 +22,7 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_came
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
-from guiderail.diagrams.stations.workcell import MovableWorkcell
+from guiderail.diagrams.stations.workcell import Hull, MovableWorkcell, Surface
 from guiderail.diagrams.tasks.bnc_connector import BncUncertainty
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import (
@@ -47,7 +47,6 @@ from guiderail.models.common.parsing import add_models
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
-from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.movement_primitive import HistoryBuffer
 from guiderail.tools.learning.learner_config import resolve_preset

@@ -1,4 +1,4 @@
-"""Commands `study`, `robustness`, `converge`, `certify`, `report` and `benchmark`."""
+"""Commands `study`, `ensemble`, `robustness`, `converge`, `certify`, `report` and `benchmark`."""
 
 from importlib import import_module
 from pathlib import Path
@@ -52,6 +52,24 @@ def study(
     print_result(result, as_json)
     if "failed" in result:
         raise RunsFailedError(result["failed"], None)
+
+
+@cli.command("ensemble runs/seed0 runs/seed1 runs/seed2 --out runs/mean")
+def ensemble(
+    runs: Annotated[list[str], argument("Folders of runs with the same observations and guidance.", "RUN...")],
+    out: Annotated[Path, option("Folder to write; it must not exist.")],
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Write the mean of several runs' policies as one policy.
+
+    The folder is evaluated like a run: guiderail evaluate runs/mean. The standard deviation of the networks' actions is
+    the column disagreement of the step log that evaluate --steps writes.
+    """
+    from guiderail_studies.ensemble import write_ensemble
+
+    members = write_ensemble(runs, out).members
+    print_result({"policy": str(out), "networks": len(members)}, as_json)
 
 
 @cli.command("robustness runs/connector --env station=mujoco --episodes 50")

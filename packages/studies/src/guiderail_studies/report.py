@@ -14,6 +14,7 @@ import jinja2
 import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import (
@@ -25,7 +26,7 @@ from guiderail.tools.evaluation.metrics import (
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
-from guiderail.tools.visualization.figures import WINDOW, draw_runs, legend_above, new_figure
+from guiderail.tools.visualization.figures import WINDOW, legend_above, new_figure, rolling
 from guiderail_studies.report_data import LEARNED, ReportData, Run, command, flat, gather
 from guiderail_studies.run_statistics import bootstrap_band, interquartile_mean, median_survival, survival
 
@@ -371,3 +372,29 @@ def _svg(figure: Any, description: str) -> str:
     text = content.getvalue()
     text = text[text.index("<svg") :]
     return text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)
+
+
+def draw_runs(
+    axis: Axes,
+    runs: Sequence[Sequence[float] | np.ndarray],
+    *,
+    window: int = WINDOW,
+    band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = lambda values: (values.min(0), values.max(0)),
+    **line: Any,
+) -> None:
+    """Draw the learning curve of a method: the mean over runs of a moving mean, and a band.
+
+    Args:
+        axis: Axes.
+        runs: Values over the episodes of each run, at least one run; longer runs are cut to the shortest.
+        window: Episodes of the moving mean.
+        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each; by default the
+            range of the runs.
+        line: Arguments of the line, such as `color`, which the band has too, and `label`.
+    """
+    length = min(len(run) for run in runs)
+    smooth = np.stack([rolling(run, window)[:length] for run in runs])
+    episodes = np.arange(1, length + 1)
+    if len(runs) > 1:
+        axis.fill_between(episodes, *band(smooth), color=line.get("color"), alpha=0.15, linewidth=0)
+    axis.plot(episodes, smooth.mean(axis=0), **line)

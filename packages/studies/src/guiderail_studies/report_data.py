@@ -7,7 +7,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluate import evaluate_once, evaluate_trained
-from guiderail.tools.evaluation.evaluation import BASELINES_FOLDER, POLICY, stored_episodes
+from guiderail.tools.evaluation.evaluation import BASELINES_FOLDER, POLICY, POLICY_FOLDER, episodes_file, policy_digest
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.learner_config import PRESETS
@@ -285,7 +285,7 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
     counts: dict[str, dict[str, Any]] = {}
     names = {"study": "", "part_of": "", "source": "", "method": run.method}
     run_columns = {**names, "seed": run.config.seed, "after_episodes": len(run.episodes)}
-    for name, rows in stored_episodes(RunFolder(run.path), run.config, HELD_OUT_SEED):
+    for name, rows in _stored_episodes(RunFolder(run.path), run.config, HELD_OUT_SEED):
         policy = LEARNED if name == POLICY else name
         if policy not in counts or counts[policy]["episodes"] < len(rows):
             count = {"episodes": len(rows), "successes": int(rows["success"].sum())}
@@ -376,3 +376,21 @@ def _read_columns(path: Path) -> list[str]:
         return []
     except OSError as error:
         raise InputError(f"the table '{path}' can't be read ({error.strerror}): check the path") from error
+
+
+def _stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the name of each policy and its stored episodes in the run's own environment, with `seed` as first seed."""
+    digest = policy_digest(folder.path)
+    for file in sorted(
+        path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
+    ):
+        name, rows = file.stem.rpartition("-")[0], read_table(file)
+        kwargs = {"episodes": len(rows), "seed": seed}
+        # `about` of a baseline policy is None if it was given by name, and its name if it was given as a function.
+        abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)
+        try:
+            files = [episodes_file(file.parent, name, config, config.environment, about=a, **kwargs) for a in abouts]
+        except InputError:  # the name is not that of a policy: a file of another program
+            continue
+        if file in files:
+            yield name, rows

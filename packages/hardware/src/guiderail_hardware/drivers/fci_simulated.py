@@ -30,13 +30,12 @@ from franky_sim.mujoco_simulator import FrankaMujocoRobot, MujocoSimulator
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.stations.workcell import ConvexWorkcell
 from guiderail.diagrams.tasks.insertion import part_poses
-from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.fci_lockstep import LockstepServer
 from guiderail_hardware.drivers.fci_reflexes import Reflex, ReflexDetector
 from guiderail_hardware.station import payload_on_flange
 from guiderail_mujoco.station import FIXTURE, WORKPIECE, MujocoContact, constraint_torques, mujoco_parts
+from guiderail_mujoco.surfaces import surfaces_of
 
 ROBOT, FLANGE_HEIGHT = "robot0_", 0.107  # prefix of the simulator's names; distance of flange and link 7 [m]
 STEP = 0.001  # period of the protocol [s]
@@ -104,7 +103,7 @@ class WorkcellSimulator(MujocoSimulator):
     """Simulated FR3 with a task's parts: the workpiece on the flange, and the fixture in the world."""
 
     def __init__(self, workcell: Any, joint_friction: float = RESIDUAL_FRICTION):
-        """Construct the simulator of a task's workcell, a `ConvexWorkcell`, with a friction of each joint [Nm].
+        """Construct the simulator of a task's workcell with convex solids, with a friction of each joint [Nm].
 
         Raises:
             InputError: If the workcell has no convex solids, or more pairs of surfaces than MuJoCo distinguishes.
@@ -115,11 +114,7 @@ class WorkcellSimulator(MujocoSimulator):
         context = plant.CreateDefaultContext()
         X_FlangeTool = self.model_of_arm.arm.tool_center.CalcPose(context, plant.GetFrameByName("panda_flange"))
         self._X_LinkTool = RigidTransform([0, 0, FLANGE_HEIGHT]) @ X_FlangeTool
-        if not isinstance(workcell, ConvexWorkcell):
-            raise InputError(f"the simulated robot collides convex solids, and {type(workcell).__name__} has none")
-        fixture, workpiece, assets = mujoco_parts(
-            workcell.fixture_surfaces(), workcell.workpiece_surfaces(), MujocoContact()
-        )
+        fixture, workpiece, assets = mujoco_parts(*surfaces_of(workcell), MujocoContact())
         self._workcell: Any = workcell
         self._parts, self._assets, self._joint_friction = (fixture, workpiece), assets, joint_friction
         self._arm: SimulatedFranka | None = None

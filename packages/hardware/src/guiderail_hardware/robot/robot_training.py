@@ -22,7 +22,6 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
-from guiderail.tools.learning.processes import PipelinedLearner
 from guiderail.tools.learning.run_folder import (
     RunConfig,
     RunFolder,
@@ -36,6 +35,7 @@ from guiderail.tools.progress import EpisodeProgress
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import record_size
+from guiderail_hardware.robot.pipelined_learner import PipelinedLearner
 from guiderail_hardware.robot.records import check_room
 from guiderail_hardware.robot.robot_env import RobotEnv
 from guiderail_hardware.robot.session import robot_session

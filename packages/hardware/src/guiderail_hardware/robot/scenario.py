@@ -1,5 +1,6 @@
 """Scenario file: robot, driver address and surroundings in Drake's terms, real or simulated."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,20 +93,42 @@ def _check_kind(node: Any, kind: type[yaml.Node], name: str, what: str) -> None:
         raise ValueError(f"{what} must be {name}, not {actual}")
 
 
+def read_typed(
+    path: Path,
+    defaults: Any,
+    what: str,
+    tags: tuple[str, ...],
+    check: Callable[[str], None] = lambda text: None,
+) -> Any:
+    """Read a YAML file as an object of the class of `defaults`.
+
+    Args:
+        path: File.
+        defaults: Object with the values that the file may leave out.
+        what: Noun for messages.
+        tags: Accepted tags, which name classes.
+        check: Function that raises a ValueError for a text that Drake's reader has no message for.
+
+    Raises:
+        InputError: If the file does not exist, is too large, or is not of the class.
+    """
+    text = read_bytes(path, what, MAX_SIZE).decode("utf-8", errors="replace")
+    check_yaml(text, str(path), tags)  # Drake's reader has no limits
+    try:
+        check(text)
+        return yaml_load_typed(schema=type(defaults), data=text, defaults=defaults)
+    except (yaml.YAMLError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is no {what}: {reason}") from error
+
+
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file.
 
     Raises:
         InputError: If the file does not exist or is invalid, or sets an unsupported field of a driver or a bus.
     """
-    text = read_bytes(path, "scenario", MAX_SIZE).decode("utf-8", errors="replace")
-    check_yaml(text, str(path), _TAGS)  # Drake's reader has no limits
-    try:
-        _check_kinds(text)
-        scenario = yaml_load_typed(schema=Scenario, data=text, defaults=Scenario())
-    except (yaml.YAMLError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is no scenario: {reason}") from error
+    scenario = read_typed(path, Scenario(), "scenario", _TAGS, _check_kinds)
     if scenario.station not in (HARDWARE, SIMULATION):
         raise InputError(f"{path}: a station is {HARDWARE} or {SIMULATION}, not {scenario.station!r}")
     if len(scenario.model_drivers) != 1:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.scenario import load_station
 from guiderail.models.common.errors import InputError
+from guiderail_hardware.scenario_station import load_station
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "press.station.yaml"
+EXAMPLE = Path(__file__).parents[4] / "examples" / "press.station.yaml"
 ABOVE = np.array([0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
 
 

@@ -15,8 +15,8 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import entries_of, load_module
 from guiderail.tools.learning.learner import Learner, register_learner
-from guiderail.tools.learning.learner_config import BcConfig
 from guiderail.tools.learning.networks import export_layers
+from guiderail_lerobot.config import BcConfig
 
 
 @register_learner("bc")

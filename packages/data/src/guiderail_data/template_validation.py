@@ -1,4 +1,4 @@
-"""Checks of a template in addition to those when its file is read.
+"""Checks of a shared control template in addition to those when its file is read.
 
 The checks place the template's objects and the end effector at random poses near each other, and evaluate the
 template's input mappings, active constraints and transitions there. A fault that occurs in less than one of a few
@@ -7,10 +7,13 @@ hundred poses may not be found. An error is proven by a pose or by a contradicti
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates.active_constraints import (
     ActiveConstraint,
@@ -21,8 +24,10 @@ from guiderail.models.templates.active_constraints import (
 )
 from guiderail.models.templates.consistency import find_contradiction
 from guiderail.models.templates.parts import Frames, pose_distance
-from guiderail.models.templates.template import SharedControlTemplate, TemplateState
+from guiderail.models.templates.schema import load_template, shipped_templates
+from guiderail.models.templates.template import SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates.transitions import AxisDistance, Distance, Height, TiltToGo
+from guiderail.tools.files import path_exists
 
 SAMPLES = 200  # number of sampled poses of the end effector
 REACH = 0.6  # largest distance of a sampled pose from an object [m]
@@ -31,6 +36,9 @@ GREEDY_STEPS = 400  # largest number of steps of a search for a transition
 GREEDY_PERIOD = 0.05  # time step of a search [s]
 CONTROL_PERIOD = 0.01  # time step of a search close to the threshold of a transition [s]
 ARRIVALS = 5  # largest number of searches that approach each transition
+
+_TEMPLATE_ENDINGS = (".yaml", ".yml")
+_SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a loaded transition distance, by the unit in the template file
 
 Scene = tuple[RigidTransform, Frames]  # pose of the end effector, and poses of the objects
 
@@ -41,6 +49,46 @@ class Finding:
 
     is_error: bool
     message: str
+
+
+def describe_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """Validate a template and return its inputs, frames, states and transitions, with remarks.
+
+    With `draw`, its state machine is drawn to a .png, .svg, .pdf, .dot or .gv file.
+    """
+    if not path_exists(file) and str(file) not in shipped_templates():
+        raise InputError(
+            f"there is no file {file}: name a template (.yaml), or one of {', '.join(shipped_templates())}"
+        )
+    if path_exists(file) and file.suffix not in _TEMPLATE_ENDINGS:
+        raise InputError(f"{file} has the ending {file.suffix!r}: a template is .yaml")
+    template = load_template(file)
+    findings = validate(template)
+    errors = [finding.message for finding in findings if finding.is_error]
+    if errors:
+        raise InputError(f"{file}: " + "; ".join(message.rstrip(".") for message in errors))
+    if draw is not None:
+        from guiderail_data.template_drawing import draw as draw_template
+
+        draw_template(template, draw)
+    return {
+        "file": str(file),
+        "template": template.name,
+        "inputs": template.inputs,
+        "frames": list(template.frames),
+        "states": [state.name for state in template.states],
+        "transitions": [_describe_transition(s, t) for s in template.states for t in s.transitions],
+        "remarks": [finding.message for finding in findings if not finding.is_error],
+    }
+
+
+def _describe_transition(state: TemplateState, transition: Transition) -> str:
+    """Return a transition as text, with its unit and the threshold of the transition back."""
+    unit = _SI_UNITS[state.transition_distance.unit]
+    text = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
+    if transition.hysteresis is None:
+        return f"{text}, no way back"
+    return f"{text}, back above {transition.below + transition.hysteresis:g} {unit}"
 
 
 def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:

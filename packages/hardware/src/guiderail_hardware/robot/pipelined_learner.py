@@ -1,205 +1,30 @@
-"""Learning next to acting: actors in forks simulate episodes, or gradient steps run in a second process."""
+"""Training in a second process while this process acts: a robot must not wait for gradient steps."""
 
 from __future__ import annotations
 
-import copy
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import torch
-from stable_baselines3.common.utils import set_random_seed
 
 from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.episode import Callback, Transition, has_image
-from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
-from guiderail.tools.evaluation.rollout import new_columns, rollout
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
-from guiderail.tools.learning.checkpoint import entries_of, load_module, module_arrays, restore_modules
-from guiderail.tools.learning.environment_set import select_environment
-from guiderail.tools.learning.episodes import Episodes
+from guiderail.tools.learning.checkpoint import entries_of
+from guiderail.tools.learning.episodes import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
-
-Weights = dict[str, np.ndarray]  # parameters and buffers of the modules that a learner acts with, as MODULE/NAME
-
-
-class Snapshot(NamedTuple):
-    """State of a learner that an actor needs."""
-
-    weights: Weights
-    transitions: int  # number of transitions that the learner has learned from
-    greedy_successes: int  # number of consecutive successes in greedy episodes
-
-
-class SimulatedEpisode(NamedTuple):
-    """Episode that an actor simulated."""
-
-    number: int
-    row: dict[str, Any]  # row in the table of the run
-    transitions: list[Transition]
-    is_greedy: bool  # True if the learner acted without exploration
-
-
-class ActorEpisodes(Episodes):
-    """Episodes that N actors, which are forks of this process, simulate while this process learns.
-
-    Episode k uses the weights learned from the first k − N episodes, in their order; its random numbers depend only on
-    the seed and k. The result of a run therefore depends on N but not on the timing of the processes; the conditions of
-    episode k do not depend on N. With N = 1, an episode is simulated while the learner learns from the previous one.
-    """
-
-    def __init__(self, episodes: Episodes, learner: Learner):
-        """Construct the episodes in the environment of `episodes`, which was reset; the first one starts the actors."""
-        super().__init__(episodes.config, episodes.env, episodes.demonstrator)
-        if not isinstance(learner, OffPolicyLearner):
-            raise InputError("only an off-policy learner has parallel actors: choose tqc, sac, td3 or crossq")
-        if not can_fork():
-            raise InputError("parallel actors are forks, which this process cannot create: leave num_envs out")
-        if has_image(self.env.observation_space):
-            raise InputError("parallel actors are forks, which cannot render images: leave num_envs out")
-        self._learner, self._num_envs = learner, self.config.learner.num_envs
-        self._callbacks: tuple[Callback, ...] = ()  # they run in the actors' processes
-        self._forks: Forks | None = None
-        self._learned = self._assigned = 0  # numbers of episodes learned from and assigned
-        self._simulated: dict[int, SimulatedEpisode] = {}
-        self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
-        self._earlier_episodes = 0  # episodes of the run that `init_from` names
-
-    def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
-        """Learn from episode `index`, which must be the next one, and return its row."""
-        if self._forks is None:
-            self._callbacks, self._earlier_episodes = callbacks, self._learner.episodes - index
-            self._forks = Forks(self._simulate, min(self._num_envs, self.config.episodes - index))
-        try:
-            return self._learn(index)
-        except KilledError:
-            raise InputError("an actor was killed: resume the run, which continues from its last checkpoint") from None
-
-    def _learn(self, index: int) -> dict[str, Any]:
-        while index not in self._simulated:
-            self._exchange(None)
-        learner, episode = self._learner, self._simulated.pop(index)
-        weights, actor = self._snapshots[self._required(index)].weights, copy.deepcopy(learner.actor())
-        load_module(actor, entries_of(weights, "averaged") or entries_of(weights, "actor"))
-        learner.start_recorded(episode.is_greedy, actor)
-        for transition in episode.transitions:
-            learner.on_step(transition)
-            self._exchange(0.0)  # an idle actor must not wait until the whole episode is learned
-        row = {**episode.row, **new_columns(learner, episode.row)}
-        self._learned += 1
-        self._snapshots[self._learned] = _snapshot(learner)
-        oldest = self._required(self._learned)
-        self._snapshots = {number: snapshot for number, snapshot in self._snapshots.items() if number >= oldest}
-        self._exchange(0.0)
-        return row
-
-    def _required(self, index: int) -> int:
-        """Return the number of episodes that the weights for episode `index` are learned from."""
-        return max(0, index - self._num_envs)
-
-    def _exchange(self, timeout: float | None) -> None:
-        """Assign episodes to idle actors and collect simulated ones; wait at most `timeout` [s], forever if None."""
-        assert self._forks is not None
-        while self._forks.has_idle and self._assigned < self.config.episodes:
-            if (required := self._required(self._assigned)) > self._learned:
-                break
-            self._forks.submit((self._assigned, self._snapshots[required]))
-            self._assigned += 1
-        for episode in self._forks.collect(timeout):
-            self._simulated[episode.number] = episode
-
-    def _simulate(self, assignment: tuple[int, Snapshot]) -> SimulatedEpisode:
-        """Simulate an episode; called in a fork."""
-        (index, snapshot), learner = assignment, self._learner
-        conditions, exploration, process = np.random.SeedSequence([self.config.seed, index]).spawn(3)
-        select_environment(self.env, index)
-        self.env.unwrapped.np_random = np.random.default_rng(conditions)
-        learner.random = np.random.default_rng(exploration)
-        set_random_seed(int(process.generate_state(1)[0]))  # global generators, which Stable-Baselines3 uses
-        load_weights(learner, snapshot.weights)
-        learner.episodes, learner.transitions = self._earlier_episodes + index, snapshot.transitions
-        learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
-        recorder = _EpisodeRecorder(learner)
-        row = rollout(self.env, self.policy(learner, index), recorder, *self._callbacks, index=index)
-        return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)
-
-    def end(self) -> None:
-        """End the actors, and discard the episodes that they simulated ahead."""
-        if self._forks is not None:
-            self._forks.close()
-            self._forks = None
-
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return the snapshots that the next episodes use."""
-        arrays = {
-            f"{number}/{name}": array
-            for number, snapshot in self._snapshots.items()
-            for name, array in snapshot.weights.items()
-        }
-        return arrays, {str(number): counts for number, (_, *counts) in self._snapshots.items()}
-
-    def restore(self, rows: list[dict[str, Any]], arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Restore a result of `state`; episodes simulated ahead of the checkpoint are simulated again."""
-        self._snapshots = {int(k): Snapshot(entries_of(arrays, k), *counts) for k, counts in values.items()}
-        self._learned = self._assigned = len(rows)
-
-
-class _EpisodeRecorder(Callback):
-    """Callback that records an episode's transitions and starts the episode of the acting learner."""
-
-    def __init__(self, learner: OffPolicyLearner):
-        self._learner = learner
-        self.transitions: list[Transition] = []
-
-    def on_episode_start(self) -> None:
-        self._learner.on_episode_start()
-
-    def on_step(self, transition: Transition) -> None:
-        record_transition(self.transitions, transition)
-
-
-def record_transition(transitions: list[Transition], transition: Transition) -> bool:
-    """Append a transition without its `info`; return False if the simulation failed and nothing was appended.
-
-    If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
-    """
-    if "simulation_failure" in transition.info:
-        if transitions:
-            transitions[-1] = replace(transitions[-1], truncated=True)
-        return False
-    transitions.append(replace(transition, info={}))
-    return True
-
-
-def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
-    modules = {"actor": learner.model.actor}
-    return modules if learner.averaged is None else modules | {"averaged": learner.averaged}
-
-
-def copy_weights(learner: OffPolicyLearner) -> Weights:
-    """Return a copy of the weights that a learner acts with."""
-    return {name: array.copy() for name, array in module_arrays(_modules(learner), {}).items()}
-
-
-def load_weights(learner: OffPolicyLearner, weights: Weights) -> None:
-    """Set the weights that a learner acts with."""
-    restore_modules(weights, _modules(learner), {})
-
-
-def _snapshot(learner: OffPolicyLearner) -> Snapshot:
-    return Snapshot(copy_weights(learner), learner.transitions, learner.greedy_successes)
 
 
 class PipelinedLearner(Learner):
@@ -239,14 +64,13 @@ class PipelinedLearner(Learner):
                 registers the learner.
         """
         if not isinstance(acting, OffPolicyLearner):
-            raise InputError("only an off-policy learner can be pipelined: choose tqc, sac, td3 or crossq")
+            raise InputError("only an off-policy learner trains while it acts: choose tqc, sac, td3 or crossq")
         self._acting, self._waits, self._excluded = acting, waits, excluded
         self._transitions: list[Transition] = []
         self._pending: list[Transition] | None = None  # a finished episode that is not submitted yet
-        self._metrics: dict[str, float] = {}
         self.known = self.submitted = self.late = 0
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([__name__])  # the fork server imports this module once for all runs of a study
+        context.set_forkserver_preload([__name__])
         self._pipe, child_pipe = context.Pipe()
         child_arguments = (child_pipe, niceness, tuple(imports), *arguments)
         self._process = context.Process(target=_serve, args=child_arguments, daemon=True)
@@ -297,7 +121,7 @@ class PipelinedLearner(Learner):
     def submit_episode(self) -> None:
         """Send the finished episode to the training process, unless it was excluded."""
         if self._pending is not None:
-            self._send(("learn", self._pending, self.records_metrics))
+            self._send(("learn", self._pending))
             self._pending = None
             self.submitted += 1
 
@@ -327,11 +151,6 @@ class PipelinedLearner(Learner):
         """Terminate the training process."""
         self._process.terminate()
         self._process.join()
-
-    def metrics(self) -> Mapping[str, float]:
-        """Return the metrics that the training process recorded for the newest weights."""
-        metrics, self._metrics = self._metrics, {}
-        return metrics
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """Return the policy of the acting learner; the entries of `description` are added to its description."""
@@ -390,8 +209,7 @@ class PipelinedLearner(Learner):
         return answer
 
     def _receive_weights(self) -> None:
-        weights, self._metrics = self._receive()
-        load_weights(self._acting, weights)
+        load_weights(self._acting, self._receive())
         self.known += 1
 
 
@@ -446,13 +264,10 @@ def _read(pipe: Connection, requests: SimpleQueue[tuple[Any, ...]]) -> None:
 _NO_ANSWER = object()
 
 
-def _learn(
-    learner: OffPolicyLearner, transitions: list[Transition], records_metrics: bool
-) -> tuple[Weights, Mapping[str, float]]:
-    learner.records_metrics = records_metrics
+def _learn(learner: OffPolicyLearner, transitions: list[Transition]) -> Weights:
     for transition in transitions:
         learner.on_step(transition)
-    return copy_weights(learner), learner.metrics()
+    return copy_weights(learner)
 
 
 def _restore(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str | None:

@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import GetScopedFrameByNameMaybe, ModelDirective
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
@@ -23,12 +21,9 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.files import read_bytes
 from guiderail.models.common.parsing import follow_directives
-from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 from guiderail.systems.wrench_sensors import WrenchSensor
-
-_TAGS = ("!Rpy",)  # accepted tags of directives
+from guiderail_hardware.robot.scenario import read_typed
 
 
 @dataclass
@@ -129,13 +124,7 @@ def load_station(path: str | Path) -> ScenarioStation:
         InputError: If the file does not exist or is no scenario, or as `ScenarioStation`.
     """
     path = Path(path)
-    text = read_bytes(path, "scenario", MAX_SIZE).decode("utf-8", errors="replace")
-    check_yaml(text, str(path), _TAGS)  # Drake's reader has no limits
-    try:
-        scenario = yaml_load_typed(schema=StationScenario, data=text, defaults=StationScenario())
-    except (yaml.YAMLError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is no scenario of a station: {reason}") from error
+    scenario = read_typed(path, StationScenario(), "scenario of a station", tags=("!Rpy",))
     return ScenarioStation(scenario, path.parent)
 
 

@@ -1,24 +1,32 @@
-"""Pipelined learner: training in a second process."""
+"""Learner that acts while a second process trains."""
 
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
+from gymnasium import spaces
 from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import read_step_log
+from guiderail.tools.learning.checkpoint import load_off_policy, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.learner_config import resolve_preset
-from guiderail.tools.learning.processes import PipelinedLearner, _write
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail_hardware.robot.pipelined_learner import PipelinedLearner, _write
+
+OBSERVED, HIDDEN = 3, 2  # sizes of an observation and of a privileged observation
 
 
-def make_learner(algorithm="sac", **options):
+def make_learner(algorithm="sac", *, privileged=False, **options):
     """Return a pipelined learner and its acting learner; `algorithm` trains in the second process."""
     env = SpacesOnlyEnv()
+    env.privileged_space = spaces.Box(-np.inf, np.inf, (HIDDEN,), np.float32)
     small = {
+        "privileged_critic": privileged,
         "net_arch": (8, 8),
         "learning_starts": 4,
         "batch_size": 4,
@@ -86,3 +94,45 @@ def test_pipelined_learner_acts_with_weights_two_episodes_old(forkserver):
     learner.finish()
     assert (learner.known, acting.transitions, acting.episodes) == (4, 24, 4)
     assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])
+
+
+def run_episode(learner, seed=0):
+    rng = np.random.default_rng(seed)
+    learner.on_episode_start()
+    for _ in range(8):
+        observation, hidden = (rng.uniform(-1, 1, size).astype(np.float32) for size in (OBSERVED, HIDDEN))
+        action = learner.act(observation)
+        learner.on_step(Transition(observation, action, 1.0, observation, False, False, {}, hidden, hidden))
+    learner.on_episode_end({"termination": "success", "success": True})
+
+
+def test_learner_restores_a_pending_episode(forkserver):
+    """The pending episode of a checkpoint contains the hidden values."""
+    whole, resumed = (make_learner(privileged=True)[0] for _ in range(2))
+    run_episode(whole)
+    arrays, values = whole.state()
+    assert arrays["pending/privileged"].shape == (8, HIDDEN)
+    random_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    whole.submit_episode()
+    whole.finish()
+    torch.set_rng_state(random_state[0])
+    np.random.set_state(random_state[1])  # noqa: NPY002
+    resumed.restore(arrays, values)
+    resumed.finish()
+    observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
+    policies = [learner.policy({"observation_shape": [OBSERVED]}) for learner in (whole, resumed)]
+    np.testing.assert_array_equal(policies[0](observation), policies[1](observation))
+
+
+def test_simulated_run_starts_from_a_run_of_a_robot(forkserver, tmp_path):
+    learner, _ = make_learner()
+    for seed in range(2):
+        run_episode(learner, seed)
+        learner.submit_episode()
+    arrays, values = learner.state()
+    save_checkpoint(RunFolder(tmp_path).checkpoint, arrays, {"learner": values})
+    learner.finish()
+    stored, learned = load_off_policy(str(tmp_path))
+    assert (learned["transitions"], learned["episodes"]) == (16, 2)
+    for name in ("policy/actor.mu.weight", "buffer/rewards"):
+        np.testing.assert_array_equal(np.ravel(stored[name]), np.ravel(arrays[f"learning/{name}"]))

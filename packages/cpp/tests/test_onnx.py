@@ -16,9 +16,9 @@ from guiderail.models.laws import load_law
 from guiderail.models.policy import Policy
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
-from guiderail.tools.export import export_skill, policy_to_onnx
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
+from guiderail_cpp.onnx import export_onnx, policy_to_onnx
 
 
 @settings(deadline=None, max_examples=40)
@@ -49,10 +49,10 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
 @pytest.mark.parametrize("name", ["connector", "passage"])
 def test_loop_of_the_docs_acts_as_the_environment(name, tmp_path, monkeypatch):
     """The loop without an environment in docs/use.md commands what the environment of the run commands."""
-    page = (Path(__file__).parents[2] / "docs/use.md").read_text("utf-8").partition("\n## A skill without")[2]
+    page = (Path(__file__).parents[3] / "docs/use.md").read_text("utf-8").partition("\n## A skill without")[2]
     (code,) = re.findall(r"```python\n(.*?)```", page.partition("\n## ")[0], re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    export_skill(f"pretrained:{name}", Path("connector"))
+    export_onnx(f"pretrained:{name}", Path("connector"))
     loop: dict = {}
     exec(compile(code, "use.md", "exec"), loop)
     skill, config = loop["skill"], RunFolder(find_run(f"pretrained:{name}")).config()
@@ -111,7 +111,7 @@ def test_export_refuses_options_that_its_loop_lacks(option, value, tmp_path, mon
     config = replace(config, environment={**config.environment, option: value})
     monkeypatch.setattr(RunFolder, "config", lambda self: config)
     with pytest.raises(InputError, match=f"{option}={value} cannot be exported"):
-        export_skill("pretrained:passage", tmp_path / "out")
+        export_onnx("pretrained:passage", tmp_path / "out")
 
 
 @pytest.mark.parametrize("content", [None, "{", "{}"])
@@ -120,11 +120,3 @@ def test_law_is_refused_without_an_exported_skill(content, tmp_path):
         (tmp_path / "skill.json").write_text(content)
     with pytest.raises(InputError, match="is no exported skill"):
         load_law(tmp_path)
-
-
-def test_target_of_missing_sibling_names_the_line_that_installs_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("guiderail.tools.cli.commands.find_plugins", lambda kind: iter(()))
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "pretrained:connector", "--target", "cpp", "--out", str(tmp_path / "skill")])
-    line = 'guiderail export --target cpp needs guiderail-cpp, which is not installed: pip install "guiderail[cpp]"'
-    assert (ended.value.code, capsys.readouterr().err) == (2, f"guiderail: {line}\n")

@@ -1,4 +1,4 @@
-"""Drawings of a template's state machine, as Graphviz text or as a picture."""
+"""Drawings of a shared control template's state machine, as Graphviz text or as a picture."""
 
 import io
 import math

@@ -1,6 +1,4 @@
-"""Collision geometry as convex solids, for physics engines that do not support other shapes."""
-
-from dataclasses import dataclass, field
+"""Convex pieces of a ring."""
 
 import numpy as np
 
@@ -10,51 +8,6 @@ from guiderail.models.common.transforms import MM
 # piece is sideways at the seam. Each piece therefore has a shoulder: it extends by SHOULDER [m] into its neighbours and
 # slopes down, by nine degrees, to the depth BELOW [m] under their surface.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """Cylinder about its z axis."""
-
-    radius: float  # [m]
-    length: float  # [m]
-
-
-@dataclass(frozen=True)
-class Box:
-    """Box with edges along the axes of its frame."""
-
-    x: float  # [m]
-    y: float  # [m]
-    z: float  # [m]
-
-
-@dataclass(frozen=True)
-class Hull:
-    """Convex hull of vertices (V, 3) [m]."""
-
-    vertices: np.ndarray
-
-
-@dataclass(frozen=True)
-class Spring:
-    """Spring-loaded prismatic joint of a surface: adds compliance where a physics engine's contact is too stiff."""
-
-    axis: tuple[float, float, float]  # direction of the joint (3,) in the body's frame
-    stiffness: float  # [N/m]
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Convex solid of a body's collision geometry."""
-
-    name: str  # unique name
-    pair: str  # name of the pair; surfaces of two bodies collide if their pairs have the same name
-    shape: Cylinder | Box | Hull  # shape in the surface's frame
-    friction: float  # friction coefficient of the pair
-    position: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))  # position (3,) [m] of the frame in the body
-    pitch: float = 0.0  # rotation of the frame about the body's y axis [rad]
-    spring: Spring | None = None  # joint that carries the surface; None if the surface is fixed to the body
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:

@@ -7,10 +7,10 @@ import yaml
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.templates import load_template, parse_template
-from guiderail.models.templates.drawing import draw, to_dot
-from guiderail.models.templates.validate import validate
+from guiderail_data.template_drawing import draw, state_lines, to_dot
+from guiderail_data.template_validation import validate
 
-TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
+TEMPLATE = (Path(__file__).parents[3] / "tests/models/templates/reach.yaml").read_text()
 
 
 def parse_changed(change=None, text=TEMPLATE):
@@ -117,6 +117,13 @@ def test_draw_shows_every_state_and_transition(tmp_path):
     for suffix in (".dot", ".png"):
         draw(template, tmp_path / f"pouring{suffix}")
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
+
+
+def test_drawing_has_the_limits_of_a_state():
+    limits = {"max_force_n": 10, "max_torque_nm": 0.5, "max_speed_m_per_s": 0.2, "max_speed_rad_per_s": 1.0}
+    far, near = parse_changed(lambda data: data["states"]["far"].update(limits)).states
+    assert state_lines(far)[-5:-1] == ["|f| ≤ 10 N", "|τ| ≤ 0.5 Nm", "|v| ≤ 0.2 m/s", "|ω| ≤ 1 rad/s"]
+    assert not any("≤" in line for line in state_lines(near))
 
 
 @pytest.mark.parametrize("ending", ["dot", "png", "svg"])
