@@ -22,11 +22,19 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.deviation import MAX_DEVIATION, check_constraints, check_deviation
-from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential, check_kernel
 from guiderail.models.primitives.qp import UnsolvableError
 from guiderail.models.primitives.reference import ReferenceTrajectory
-from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
+from guiderail.models.primitives.window import (
+    BatchPrediction,
+    Modification,
+    Prediction,
+    StepFactor,
+    Window,
+    WindowFeatures,
+    window_features,
+    window_interpolation,
+)
 
 HISTORY, HORIZON = 10, 40
 """Default numbers of past outputs P of sKGRL, and of future points H with constraints."""

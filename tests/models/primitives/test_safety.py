@@ -14,8 +14,7 @@ from guiderail.models.primitives import (
     UnsolvableError,
 )
 from guiderail.models.primitives import window as window_module
-from guiderail.models.primitives.features import window_features
-from guiderail.models.primitives.window import StepFactor, Window
+from guiderail.models.primitives.window import StepFactor, Window, window_features
 from oracles.problems import random_problem
 
 SEEDS = st.integers(0, 2**32 - 1)
