@@ -11,6 +11,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.tables import read_table, table_text
 
@@ -21,8 +22,8 @@ def report(text: str) -> None:
 
 
 def continue_run(run: Path, episodes: int) -> bool:
-    """Return True for a run that is finished, or was begun and is then continued; False if it has not begun."""
-    if (run / "policy.safetensors").exists():
+    """Return True for a run that has its episodes, or was begun and is then continued; False if it has not begun."""
+    if (run / "policy.safetensors").exists() and RunFolder(run).config().episodes >= episodes:
         return True
     report(f"training {run.name}")
     if not (run / "config.yaml").exists():

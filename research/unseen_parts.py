@@ -3,8 +3,10 @@
 The parts are split by a rule before anything is trained (`split_parts`), and the split is written to `split.json`.
 Then the parts are prepared, a policy is trained over the training parts with each seed, and all policies are evaluated
 on the held-out parts: uniform random actions, the scripted search, policies of single training parts, specialists of
-the held-out parts, the general policy of each seed, and the mean of their actions. Every finished step is stored, and
-the same command resumes. `rows/` has the episodes of each policy on each part, `table.md` the successes.
+the held-out parts, the general policy of each seed, and the mean of their actions. The general policies are also
+evaluated under the uncertainty that AutoMate states, and in MuJoCo. `--few-shot` compares specialists that learn from
+scratch with those that the general policy demonstrates to. Every finished step is stored, and the same command resumes.
+`rows/` has the episodes of each policy on each part, `table.md` the successes.
 """
 
 from __future__ import annotations
@@ -32,7 +34,15 @@ from research.stored import continue_run, evaluate_stored, report
 TRAINING, HELD_OUT = 60, 30  # numbers of parts
 HELD_OUT_FRACTION = 0.34  # fraction of all pairs from which the held-out parts are taken
 ENVIRONMENT = {"guidance": "kgrl", "difficulty": "hard", "observation": "shared"}
-SETTINGS = {"symmetry": "near", "constant_episodes": 12}
+CONDITIONS = {
+    "hard": ENVIRONMENT,
+    "automate": ENVIRONMENT | {"difficulty": "automate"},
+    "mujoco": ENVIRONMENT | {"station": "mujoco"},
+}
+FEW_SHOT = (10, 20, 40, 80)  # training episodes after which a specialist is evaluated
+DEMONSTRATED = {"demonstration_episodes": 5, "demonstration_fraction": 0.5, "exploration.constant_episodes": 0}
+"""Settings of a specialist to which the general policy demonstrates: RLPD (Ball et al., 2023)."""
+SETTINGS = {"symmetry": "near", "exploration.constant_episodes": 12}
 EASY_RANDOM, EASY_SEARCH = 0.2, 0.9  # success rates above which a part cannot show learning
 
 
@@ -64,33 +74,56 @@ def prepared(folder: Path, names: Sequence[str], number: int) -> list[Path]:
     return [folder / name for name in names if (folder / name / "task.yaml").is_file()][:number]
 
 
-def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Path:
+def train_once(
+    parts: Sequence[Path], run: Path, seed: int, episodes: int, settings: Mapping[str, Any] | None = None
+) -> Path:
     """Train a policy over parts, or continue the run; return its folder."""
     names = [task_named(str(part)) for part in parts]
     if not continue_run(run, episodes):
         imports = [folder for _, folders in names for folder in folders]
-        choices = Choices(settings=SETTINGS, episodes=episodes, seed=seed, step_log=False)
+        chosen = SETTINGS | dict(settings or {})
+        choices = Choices(preset="tqc_contact", settings=chosen, episodes=episodes, seed=seed, step_log=False)
         Training(run, [name for name, _ in names], ENVIRONMENT, choices, imports=imports, pictures=False).start()
     return run
 
 
-def evaluate_part(part: Path, policies: Mapping[str, Path | str], episodes: int, out: Path) -> None:
-    """Evaluate policies, folders of runs or names of baseline policies, on the same held-out episodes of a part."""
-    sources = {out / "rows" / name / f"{part.name}.csv": source for name, source in policies.items()}
-    evaluate_stored(task_named(str(part))[0], ENVIRONMENT, sources, episodes)
+def evaluate_part(
+    part: Path, policies: Mapping[str, Path | str], episodes: int, out: Path, condition: str = "hard"
+) -> None:
+    """Evaluate policies, folders of runs or names of baseline policies, on the same held-out episodes of a part.
+
+    A part that cannot be simulated under the condition, such as one without convex pieces in MuJoCo, is reported.
+    """
+    sources = {out / "rows" / condition / name / f"{part.name}.csv": source for name, source in policies.items()}
+    try:
+        evaluate_stored(task_named(str(part))[0], CONDITIONS[condition], sources, episodes)
+    except InputError as error:
+        if condition == "hard":
+            raise
+        report(f"{part.name} is left out in {condition}: {error}")
 
 
-def tabulate(out: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the successes of each policy on each held-out part, and a summary, from the stored episodes."""
+def learn_few_shot(part: Path, general: Path, seed: int, evaluated: int, out: Path) -> None:
+    """Evaluate specialists of a part after each of `FEW_SHOT` training episodes, from scratch and demonstrated to."""
+    for name, settings in (("scratch", {}), ("demonstrated", DEMONSTRATED | {"demonstrator": str(general)})):
+        for episodes in FEW_SHOT:
+            if (out / "rows/hard" / f"{name}-{episodes}" / f"{part.name}.csv").exists():
+                continue
+            run = train_once([part], out / "runs" / f"{name}-{part.name}", seed, episodes, settings)
+            evaluate_part(part, {f"{name}-{episodes}": run}, evaluated, out)
+
+
+def tabulate(rows: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the successes of each policy on each held-out part, and a summary, from the episodes below a folder."""
     rates: dict[str, dict[str, float]] = {}
     worst: dict[str, dict[str, float]] = {}
-    for file in sorted((out / "rows").glob("*/*.csv")):
-        rows = read_table(file)
-        rates.setdefault(file.parent.name, {})[file.stem] = float(rows["success"].mean())
+    for file in sorted(rows.glob("*/*.csv")):
+        episodes = read_table(file)
+        rates.setdefault(file.parent.name, {})[file.stem] = float(episodes["success"].mean())
         limits = worst.setdefault(file.parent.name, {"peak_force": 0.0, "collisions": 0, "violation": -1.0})
-        limits["peak_force"] = max(limits["peak_force"], float(rows["peak_force"].max()))
-        limits["collisions"] += int((rows["termination"] == "collision").sum())
-        limits["violation"] = max(limits["violation"], float(rows["max_commanded_violation"].max()))
+        limits["peak_force"] = max(limits["peak_force"], float(episodes["peak_force"].max()))
+        limits["collisions"] += int((episodes["termination"] == "collision").sum())
+        limits["violation"] = max(limits["violation"], float(episodes["max_commanded_violation"].max()))
     table = pd.DataFrame(rates)
     easy = (table.get("uniform_random", 0.0) > EASY_RANDOM) | (table.get("scripted", 0.0) > EASY_SEARCH)
     table["shows_learning"] = ~easy
@@ -126,6 +159,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--specialists", type=int, default=150, help="training episodes of each held-out part's specialist; 0: none"
     )
+    parser.add_argument("--few-shot", type=int, default=10, help="held-out parts on which specialists are compared")
     parser.add_argument("--evaluated", type=int, default=100, help="held-out episodes of each part (default: 100)")
     parser.add_argument("--processes", type=int, default=1, help="pairs that are prepared at a time (default: 1)")
     parser.add_json()
@@ -161,13 +195,24 @@ def main(arguments: list[str]) -> None:
         policies[run.name] = train_once([part], run, 0, args.single_episodes)
     for part in held_out:
         evaluate_part(part, policies, args.evaluated, out)
+    general = {name: run for name, run in policies.items() if name.startswith("general-")}
+    for condition in ("automate", "mujoco"):
+        for part in held_out:
+            evaluate_part(part, general, args.evaluated, out, condition)
     for part in held_out if args.specialists else ():
         run = train_once([part], out / "runs" / f"specialist-{part.name}", 0, args.specialists)
         evaluate_part(part, {"specialist": run}, args.evaluated, out)
-    table, summary = tabulate(out)
-    write_table(out / "table", table.reset_index(names="part"))
+    for part in held_out[: args.few_shot]:
+        learn_few_shot(part, out / "runs" / "general-mean", 0, args.evaluated, out)
+    summary = {}
+    for condition in CONDITIONS:
+        if (out / "rows" / condition).is_dir():
+            table, summary[condition] = tabulate(out / "rows" / condition)
+            write_table(out / f"table_{condition}", table.reset_index(names="part"))
     write_atomically(out / "summary.json", json.dumps(summary, indent=1).encode())
-    print_result({"training_parts": len(training), "held_out_parts": len(held_out), **summary}, as_json=args.json)
+    print_result(
+        {"training_parts": len(training), "held_out_parts": len(held_out), **summary.get("hard", {})}, as_json=args.json
+    )
 
 
 if __name__ == "__main__":

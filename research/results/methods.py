@@ -34,6 +34,7 @@ README_COLUMNS = 5
 README_TITLES = ("Connector, hard, converged contact", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
 MISSING = "–"
 ALWAYS = (0, 2)  # columns that every table of methods has: name and success
+BRIEF = (0, 1, 2, 5, 6)  # columns of a brief table of methods
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
@@ -53,9 +54,9 @@ def task_table(task: str, tables: Path) -> str:
         rows = [(row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))]
         if rows:
             studies = ", ".join(f"`{study}`" for study in dict.fromkeys(row.study for row, _ in rows))
-            table = methods_table([(row.name, seeds) for row, seeds in rows])
+            table = methods_table([(row.name, seeds) for row, seeds in rows], section.is_brief)
             remarks = "".join(f"\n{line}\n" for write in REMARKS for line in write(section, tables))
-            parts.append(f"### {section.title}\n\nStudies: {studies}.\n\n{table}\n{remarks}")
+            parts.append(f"## {section.title}\n\nStudies: {studies}.\n\n{table}\n{remarks}")
     return "\n".join(parts)
 
 
@@ -122,16 +123,22 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def methods_table(methods: Sequence[tuple[str, pd.DataFrame]]) -> str:
-    """Return the Markdown table of methods; a sentence replaces a column in which all methods are equal."""
+def methods_table(methods: Sequence[tuple[str, pd.DataFrame]], is_brief: bool = False) -> str:
+    """Return the Markdown table of methods; a sentence replaces a column in which all methods are equal.
+
+    Args:
+        methods: Name and rows of each method.
+        is_brief: True for success, stops and violations only.
+    """
     rows = [(name, *_method_cells(seeds)) for name, seeds in methods]
     trained = [is_trained(seeds) for _, seeds in methods]
     values = [
         {cell for cell, learns in zip(column, trained, strict=True) if learns or cell != MISSING}
         for column in zip(*rows, strict=True)
     ]
-    kept = [index for index, column in enumerate(values) if len(column) > 1 or index in ALWAYS]
-    equal = {COLUMNS[i]: "".join(column - {MISSING}) for i, column in enumerate(values) if i not in kept}
+    columns = BRIEF if is_brief else range(len(COLUMNS))
+    kept = [index for index in columns if len(values[index]) > 1 or index in ALWAYS]
+    equal = {COLUMNS[i]: "".join(values[i] - {MISSING}) for i in columns if i not in kept}
     sentences = "; ".join(f"{name}: {value}" for name, value in equal.items() if value)
     caption = f"The same for all methods: {sentences}.\n\n" if sentences else ""
     return caption + markdown_table([COLUMNS[i] for i in kept], [[row[i] for i in kept] for row in rows])
@@ -201,22 +208,20 @@ def _has_interval(low: float, high: float, *methods: Scores) -> bool:
 
 
 def improvements(section: Section, tables: Path) -> list[str]:
-    """Return a sentence for each guided method: the probability that it is better than the best peer."""
+    """Return a sentence with the probability that each guided method is better than the best peer."""
     scores = {row.name: result for row in section.rows if (result := _scores(last_rows(tables, row))) is not None}
     peers = [row.name for row in section.rows if row.name in scores and not is_guided(row)]
-    if not peers:
+    guided = [name for name in section.guided if name in scores]
+    if not peers or not guided:
         return []
     best = max(peers, key=lambda name: (float(interquartile_mean(scores[name])), -peers.index(name)))
-    lines = []
-    for name in (name for name in section.guided if name in scores):
+    parts = []
+    for name in guided:
         pair = scores[name], scores[best]
         low, high = bootstrap_interval(probability_of_improvement, *pair)
-        interval = f"95 %: {low:.2f}–{high:.2f}; " if _has_interval(low, high, *pair) else ""
-        lines.append(
-            f"A seed of {name} succeeds more often than one of {best} with probability "
-            f"{probability_of_improvement(*pair):.2f} ({interval}ties count half)."
-        )
-    return lines
+        interval = f" (95 %: {low:.2f}–{high:.2f})" if _has_interval(low, high, *pair) else ""
+        parts.append(f"{name} {probability_of_improvement(*pair):.2f}{interval}")
+    return [f"Probability that a seed succeeds more often than one of {best}: {'; '.join(parts)}."]
 
 
 def is_guided(row: Row) -> bool:
@@ -285,13 +290,17 @@ def has_run_offset(row: Row) -> bool:
 
 def offsets(section: Section, tables: Path) -> list[str]:
     """Return a sentence that names the methods whose held-out episodes have the hidden offset of their run."""
-    rows = [row for row in section.rows if len(last_rows(tables, row))]
-    fixed = [row.name for row in rows if has_run_offset(row)]
+    rows = {row.name: seeds for row in section.rows if len(seeds := last_rows(tables, row))}
+    fixed = [row.name for row in section.rows if row.name in rows and has_run_offset(row)]
     if not fixed:
         return []
-    names = [row.name for row in rows if row.name not in fixed]
-    others = f" A new hidden offset in every held-out episode: {'; '.join(names)}." if names else ""
-    return [f"One hidden offset for each seed, in training and in held-out episodes: {'; '.join(fixed)}.{others}"]
+    others = [name for name in rows if name not in fixed]
+    sentence = "One hidden offset for each seed, in training and in held-out episodes"
+    if not others:
+        return [f"{sentence}."]
+    if fixed == [name for name, seeds in rows.items() if is_trained(seeds)]:
+        return [f"{sentence}: learned methods. A new one in every held-out episode: baseline policies."]
+    return [f"{sentence}: {'; '.join(fixed)}. A new one in every held-out episode: {'; '.join(others)}."]
 
 
 def is_trained(seeds: pd.DataFrame) -> bool:
@@ -309,6 +318,11 @@ _SAFETY = ("max_commanded_violation", "violating_episodes", "peak_force")
 
 def _safety(seeds: pd.DataFrame, prefix: str) -> pd.DataFrame:
     return seeds[[f"{prefix}{name}" for name in _SAFETY]].set_axis(_SAFETY, axis=1)
+
+
+def training_safety(seeds: pd.DataFrame) -> pd.DataFrame:
+    """Return the violations and peak forces of the training of a method, in the columns of an evaluation."""
+    return _safety(seeds, "training_")
 
 
 def span(seeds: Iterable[float]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,16 @@ from guiderail_studies.study import BREAKING_SUCCESS, curve, draw_sweeps, format
 from research.engines import condition_table
 from research.figures import FIGURES
 from research.results.methods import (
-    COLUMNS,
+    MISSING,
     effort_cell,
     is_trained,
     largest_violation,
     markdown_table,
     mean_and_range,
-    methods_table,
     span,
     success_cell,
     task_table,
+    training_safety,
 )  # fmt: skip
 from research.results.sections import SECTIONS
 from research.studies import study_names, study_path
@@ -105,12 +105,12 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
         if task == "BncConnector" and (tables / f"{ENGINES}.csv").is_file():
             sections.append(_ENGINES.format(table=condition_table(read_table(tables / f"{ENGINES}.csv"))))
         if methods := task_table(task, tables):
-            sections.append(f"## All methods\n\n{methods}")
+            sections.append(methods)
         for name, study in own.items():
             if study.sweeps:
                 draw_sweeps(study, stored[name], pages / f"{name}.svg")
         sections.append(_studies_section(own, stored))
-        sections += filter(None, (_study_section(study, stored[name]) for name, study in own.items()))
+        sections += [_sweep_section(study, stored[name]) for name, study in own.items() if study.sweeps]
         content[page] = sections
     programs = [_program_section(name, rows) for name, rows in stored.items() if name in PROGRAMS]
     if programs:
@@ -128,17 +128,18 @@ def _page_head(title: str) -> str:
 
 
 _HEAD = """\
-Written by `python -m research.results` from the tables in `research/results`. [Results](../results.md) explains how
-they were measured. Success: mean (smallest–largest seed) of 100 held-out episodes of each seed, with a 95 % interval
-for a single run. IQM: interquartile mean of the seeds. Episodes to convergence: median (smallest–largest). Stopped:
-episodes that a force above the limit, an obstacle or a spill ended.
+Written by `python -m research.results` from `research/results/NAME.csv`, a table with a row for each seed.
+[Results](../results.md) explains columns and studies. `guiderail study research/studies/NAME.yaml --out studies
+--trust-imports` runs a study.
 """
+_STUDY_COLUMNS = (
+    "study", "method", "training episodes (seeds)", "held-out success [%]", "max. commanded violation",
+)  # fmt: skip
 _STUDIES = """\
-## Studies
+## Other studies
 
-`guiderail study research/studies/NAME.yaml --out studies --trust-imports` runs a study. `research/results/NAME.csv` has
-its results with a row for each seed, and [differences.csv](differences.csv) the differences of its methods from the
-thesis. A method that the tables above omit is in the section of its study below.
+Methods and conditions that are not in the tables above. Policies without learning: see the studies' tables.
+[differences.csv](differences.csv) has the differences of all methods from the thesis.
 """
 
 
@@ -147,7 +148,7 @@ _ENGINES = """\
 
 Connector, hard, with a force-torque sensor at the wrist, in the present contact, which has converged at its plant step
 of 5 ms. Successes of held-out episodes, one number per seed. `python -m research.engines --out engines` trains and
-evaluates; `research/results/engines.csv` has forces, violations and the training of each seed.
+evaluates; `research/results/engines.csv` has forces, violations and training.
 
 {table}
 
@@ -173,61 +174,63 @@ def _words(key: str) -> str:
 
 
 def _program_section(name: str, rows: pd.DataFrame) -> str:
-    """Return the section of a program; a method with a row for each place has one row, with a slash between places."""
+    """Return the section of a program: of a method with a row for each place, the last one; equal columns once."""
     lines = [f"## {name}", "", f"`python -m research.{name} --out studies` writes `{name}.csv`."]
-    cells = rows[list(PROGRAMS[name])].astype(object).map(cell)
     if "place" in rows:
-        lines[-1] += f" Numbers: {' / '.join(rows['place'].unique())}."
-        cells = cells.groupby("method", sort=False, as_index=False).agg(" / ".join)
+        *others, place = rows["place"].unique()
+        lines[-1] += f" Place: {place}; other places in the table: {', '.join(others) or 'none'}."
+        rows = rows[rows["place"] == place]
+    cells = rows[list(PROGRAMS[name])].astype(object).map(cell)
+    equal = [column for column in cells.columns[1:] if len(cells) > 1 and cells[column].nunique() == 1]
+    if equal:
+        lines[-1] += f" In all rows: {'; '.join(f'{_words(column)} {cells[column].iloc[0]}' for column in equal)}."
+    cells = cells.drop(columns=equal)
     return "\n".join([*lines, "", markdown_table([*map(_words, cells)], cells.to_numpy().tolist()), ""])
 
 
 def _studies_section(studies: Mapping[str, Study], stored: Mapping[str, pd.DataFrame]) -> str:
-    """Return the command of a task's studies, and what was not run."""
-    lines = [_STUDIES]
+    """Return a table of the methods that the tables of all methods omit, and what was not run."""
+    cells = [row for name, study in studies.items() for row in _study_rows(study, stored[name])]
+    lines = [_STUDIES, *([markdown_table(_STUDY_COLUMNS, cells), ""] if cells else [])]
     for name, study in studies.items():
         if missing := _missing(study, stored[name]):
             lines.append(f"- `{name}`, not run: {'; '.join(missing)}")
-    return "\n".join([*lines, ""])
+    return "\n".join(lines) if lines[-1] == "" else "\n".join([*lines, ""])
 
 
-def _study_section(study: Study, rows: pd.DataFrame) -> str:
-    """Return the section of a study: sweeps, and the methods that the tables of all methods omit; empty if none is."""
-    lines = _sweep_lines(study, rows)
-    shown = {(row.study, row.method, row.eval_set) for section in SECTIONS[study.task] for row in section.rows}
-    lines += _method_lines(
-        _without_sweeps(study, rows), lambda method, name: shown & {(study.name, method, part) for part in (name, None)}
-    )
-    return "\n".join([f"## {study.name}", *lines, ""]) if lines else ""
-
-
-def _method_lines(rows: pd.DataFrame, is_shown: Callable[[str, str], object]) -> list[str]:
-    """Return a table with a row for each method and a column for each evaluation set; empty if all are shown before."""
+def _study_rows(study: Study, rows: pd.DataFrame) -> list[tuple[str, ...]]:
+    """Return the row of each learned method of a study of which the tables of all methods omit an evaluation set."""
+    rows = _without_sweeps(study, rows)
+    shown = {
+        (row.method, row.eval_set) for part in SECTIONS[study.task] for row in part.rows if row.study == study.name
+    }
     last = rows.sort_values("after_episodes", kind="stable").drop_duplicates(
         ["method", "eval_set", "seed"], keep="last"
     )
-    methods: dict[str, dict[str, pd.DataFrame]] = {}
+    cells: list[tuple[str, ...]] = []
     for method in dict.fromkeys(rows["method"]):
-        of_method = last[last["method"] == method].sort_values("seed")
-        sets = {name: of_method[of_method["eval_set"] == name] for name in dict.fromkeys(of_method["eval_set"])}
-        methods[method] = {name: part for name, part in sets.items() if not is_shown(method, name)}
-    methods = {method: sets for method, sets in methods.items() if sets}
-    names = [*dict.fromkeys(name for sets in methods.values() for name in sets)]
-    if not methods:
-        return []
-    if len(names) == 1:
-        parts = [(method, *sets.values()) for method, sets in methods.items()]
-        trained = [(method, part) for method, part in parts if is_trained(part)]
-        return ["", methods_table(trained)] if trained else []
-    numbers = {int(number) for sets in methods.values() for part in sets.values() for number in part["episodes"]}
-    format_success = mean_and_range if len(numbers) == 1 else success_cell
-    lines = [] if numbers == {100} or len(numbers) > 1 else ["", f"Success in {numbers.pop()} episodes of each seed."]
-    cells = []
-    for method, sets in methods.items():
-        rates = [format_success(sets[name]) if name in sets else "–" for name in names]
-        cells.append((method, effort_cell(next(iter(sets.values()))), *rates, largest_violation([*sets.values()])))
-    columns = ("held-out success [%] of", "training episodes (seeds)", *names, COLUMNS[-2])
-    return [*lines, "", markdown_table(columns, cells)]
+        seeds = last[last["method"] == method].sort_values("seed")
+        sets = {
+            name: seeds[seeds["eval_set"] == name]
+            for name in dict.fromkeys(seeds["eval_set"])
+            if not shown & {(method, name), (method, None)}
+        }
+        if sets and is_trained(seeds):
+            first = next(iter(sets.values()))
+            parts = [*sets.values(), training_safety(first)]
+            cells.append((f"`{study.name}`", method, effort_cell(first), _successes(sets), largest_violation(parts)))
+    return cells
+
+
+def _successes(sets: Mapping[str, pd.DataFrame]) -> str:
+    """Return the success of a method in each evaluation set, and their number of episodes if it is not 100."""
+    if len(sets) == 1:
+        return success_cell(*sets.values())
+    numbers = {int(number) for rows in sets.values() for number in rows["episodes"]}
+    if len(numbers) > 1:
+        return "; ".join(f"{name}: {success_cell(rows)}" for name, rows in sets.items())
+    each = "" if numbers == {100} else f"; of {numbers.pop()} each"
+    return "; ".join(f"{name}: {mean_and_range(rows)}" for name, rows in sets.items()) + each
 
 
 def _missing(study: Study, rows: pd.DataFrame) -> list[str]:
@@ -256,19 +259,33 @@ def _differences(studies: Mapping[str, Study], stored: Mapping[str, pd.DataFrame
     return table_text(pd.DataFrame(rows, columns=["study", "methods", "difference"]))
 
 
-def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
-    """Return the picture of a study's sweeps, and a table of the values at which each method falls below the limit."""
-    if not study.sweeps:
-        return []
+def _sweep_section(study: Study, rows: pd.DataFrame) -> str:
+    """Return the picture of a study's sweeps, and a table of the values at which each method falls below the limit.
+
+    A sentence names the methods that are below the limit at every value.
+    """
     ranges = [f"{sweep.quantity}, {min(sweep.at):g} to {max(sweep.at):g}" for sweep in study.sweeps]
     curves = {method: [curve(sweep, rows, method) for sweep in study.sweeps] for method in study.methods}
     cells = [
-        (method, *(format_breaking_point(*points) if points[0] else "–" for points in of_method))
+        (method, *(format_breaking_point(*points) if points[0] else MISSING for points in of_method))
         for method, of_method in curves.items()
         if any(values for values, _ in of_method)
     ]
-    picture = f"![Success of every method over difficulty]({study.name}.svg)"
-    return ["", picture, "", markdown_table([f"success below {BREAKING_SUCCESS:.0%} at", *ranges], cells)]
+    failed = [
+        method
+        for method, of_method in curves.items()
+        if (rates := [rate for _, points in of_method for rate, _, _ in points]) and max(rates) < BREAKING_SUCCESS
+    ]
+    lines = [f"## {study.name}", "", f"![Success of every method over difficulty]({study.name}.svg)", ""]
+    lines += [
+        markdown_table(
+            [f"success below {BREAKING_SUCCESS:.0%} at", *ranges], [row for row in cells if row[0] not in failed]
+        ),
+        "",
+    ]
+    if failed:
+        lines += [f"Below {BREAKING_SUCCESS:.0%} at every value: {', '.join(failed)}.", ""]
+    return "\n".join(lines)
 
 
 def _without_sweeps(study: Study, rows: pd.DataFrame) -> pd.DataFrame:

@@ -34,11 +34,13 @@ class Section:
         title: Title of the table.
         rows: Methods, guided ones first.
         guided: Names of the guided methods in the table of hard tasks; empty if it omits the section.
+        is_brief: True if the table has success, stops and violations only; the others are in the tables of the studies.
     """
 
     title: str
     rows: Sequence[Row]
     guided: Sequence[str] = ()
+    is_brief: bool = False
 
 
 def _baselines(
@@ -89,6 +91,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("connector_robot_sensing_baselines", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
             ],
             guided=("KGRL",),
+            is_brief=True,
         ),
         Section(
             "Connector, hard, contact at 10 ms",
@@ -105,6 +108,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("peers_connector_hard", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
             ],
             guided=("KGRL", "sKGRL, adaptive history"),
+            is_brief=True,
         ),
         Section(
             "Connector, hard, force not bounded (40 N per axis)",
@@ -117,6 +121,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("residual RL with a larger action scale", "connector_hard", "residual_far"),
                 *_baselines("connector_hard_baselines", _ALL),
             ],
+            is_brief=True,
         ),
         Section(
             "Connector, hard, from one demonstration",
@@ -124,6 +129,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("KGRL", "connector_hard_one_demonstration", "kgrl"),
                 *_baselines("connector_hard_one_demonstration", ("demonstration",), names=BASELINES[:1]),
             ],
+            is_brief=True,
         ),
         Section(
             "Connector, hard, on a base policy",
@@ -132,6 +138,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("Policy Decorator", "connector_hard_base_policy", "policy_decorator"),
                 Row("base policy alone", "connector_hard_base_policy", "base"),
             ],
+            is_brief=True,
         ),
         Section(
             "Connector, hard, commands within 2.8 mm",
@@ -139,6 +146,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_guided_and_residual("connector_hard_safety"),
                 *_baselines("connector_hard_safety", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
             ],
+            is_brief=True,
         ),
         Section(
             "Connector, one unobserved offset per training run",
@@ -149,6 +157,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("connector_baselines", _ALL, "per_run"),
             ],
             guided=("KGRL", "sKGRL"),
+            is_brief=True,
         ),
         Section(
             "Connector, another unobserved offset in every episode",
@@ -157,6 +166,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("sKGRL", "connector_disc", "skgrl"),
                 *_baselines("connector_baselines", _ALL, "per_episode"),
             ],
+            is_brief=True,
         ),
         Section(
             "Connector, with every setting of the thesis",
@@ -165,6 +175,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("sKGRL", "connector_thesis", "skgrl"),
                 *_baselines("connector_thesis", _ALL[:2], names=BASELINES[:2]),
             ],
+            is_brief=True,
         ),
     ],
     "GridClamp": [
@@ -225,6 +236,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("grid_clamp_baselines", _ALL_ZERO, names=NO_DEMONSTRATION),
             ],
             guided=("RL-SCT",),
+            is_brief=True,
         ),
     ],
     "Pouring": [
@@ -248,6 +260,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("pouring_baselines", (*_ALL_ZERO[:3], "scripted_pour"), names=NO_DEMONSTRATION),
             ],
             guided=("RL-SCT, shaped reward",),
+            is_brief=True,
         ),
     ],
     "NarrowPassage": [
@@ -278,6 +291,7 @@ SECTIONS: dict[str, list[Section]] = {
                 *_baselines("narrow_passage_baselines", _ALL[:3], names=BASELINES[:3]),
             ],
             guided=("KGRL",),
+            is_brief=True,
         ),
     ],
 }

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from manifold3d import CrossSection, Manifold, Mesh
+from manifold3d import CrossSection, Manifold, Mesh, OpType
 
 SIDES = 24
 CHAMFER = 0.5  # chamfer of a plug's tip and a socket's mouth [mm]
@@ -44,8 +44,8 @@ def _mesh(solid: Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts))
 
 
-def _disc(radius: float) -> CrossSection:
-    return CrossSection.circle(radius, SIDES)
+def _disc(radius: float, sides: int = SIDES) -> CrossSection:
+    return CrossSection.circle(radius, sides)
 
 
 def _square(width: float, depth: float, x: float = 0.0, y: float = 0.0) -> CrossSection:
@@ -77,6 +77,21 @@ def _hole(outline: CrossSection, clearance: float, low: float) -> Manifold:
 
 def _block(width: float, low: float) -> Manifold:
     return _prism(_square(width, width), low, 0.0)
+
+
+def _peg(outlines: list[CrossSection], clearance: float, low: float) -> Part:
+    """Return a peg of several convex prisms that seats on the hole's bottom at the height `low` [mm]."""
+    plug = Manifold.batch_boolean([_shaft(outline, low, 8.0) for outline in outlines], OpType.Add)
+    holes = [_hole(outline, clearance, low) for outline in outlines]
+    return Part([plug], [_block(30.0, low - 4.0) - Manifold.batch_boolean(holes, OpType.Add)], clearance)
+
+
+def _headed(outlines: list[CrossSection], clearance: float, low: float) -> Part:
+    """Return a head on the socket's face with several convex pins, which end at the height `low` [mm]."""
+    pins = [_shaft(outline, low, 0.0) for outline in outlines]
+    plug = Manifold.batch_boolean([_prism(_square(18.0, 16.0), 0.0, 6.0), *pins], OpType.Add)
+    holes = [_hole(outline, clearance, low - 1.0) for outline in outlines]
+    return Part([plug], [_block(30.0, low - 5.0) - Manifold.batch_boolean(holes, OpType.Add)], clearance)
 
 
 def keyed_peg(clearance: float = 0.2) -> Part:
@@ -185,6 +200,60 @@ def screw(clearance: float = 0.3, pitch: float = 8.0) -> Part:
     return Part([plug], [socket], clearance, ["--turn", "-180", "--pitch", f"{pitch:g}"])
 
 
+def hexagon(clearance: float = 0.15) -> Part:
+    """Return a hexagonal peg that seats on the hole's bottom."""
+    return _peg([_disc(6.0, 6)], clearance, -12.0)
+
+
+def reuleaux_triangle(clearance: float = 0.15) -> Part:
+    """Return a peg with the outline of a Reuleaux triangle, which has the same width in every direction."""
+    corners = 7.0 / np.sqrt(3.0) * np.array([(np.cos(a), np.sin(a)) for a in np.deg2rad((90.0, 210.0, 330.0))])
+    discs = [_disc(7.0, 2 * SIDES).translate(tuple(corner)) for corner in corners]
+    return _peg([discs[0] ^ discs[1] ^ discs[2]], clearance, -12.0)
+
+
+def oval(clearance: float = 0.1) -> Part:
+    """Return a peg with two flat and two round sides and a head that seats on the socket's face."""
+    outline = CrossSection.batch_hull([_disc(3.0, 16).translate((x, 0.0)) for x in (-4.0, 4.0)])
+    plug = _shaft(outline, -10.0, 0.0) + _prism(_square(20.0, 12.0), 0.0, 6.0)
+    return Part([plug], [_block(30.0, -14.0) - _hole(outline, clearance, -11.0)], clearance)
+
+
+def cross(clearance: float = 0.2) -> Part:
+    """Return a peg with the outline of a plus."""
+    return _peg([_square(14.0, 4.0), _square(4.0, 14.0)], clearance, -12.0)
+
+
+def l_profile(clearance: float = 0.2) -> Part:
+    """Return a peg with the outline of an L, whose axis is near its inner corner."""
+    return _peg([_square(12.0, 4.0, 2.0, -2.0), _square(4.0, 12.0, -2.0, 2.0)], clearance, -12.0)
+
+
+def two_prongs(clearance: float = 0.2) -> Part:
+    """Return a head with two flat prongs, of which one is wider."""
+    return _headed([_square(2.0, 6.0, -6.0), _square(2.0, 8.0, 6.0)], clearance, -12.0)
+
+
+def four_pins(clearance: float = 0.2) -> Part:
+    """Return a head with four round pins, of which one is off the corner of a square."""
+    pins = [_disc(1.5, 12).translate(center) for center in ((5.0, 5.0), (-5.0, 5.0), (-5.0, -5.0), (3.5, -5.0))]
+    return _headed(pins, clearance, -9.0)
+
+
+def shell_connector(clearance: float = 0.15) -> Part:
+    """Return a trapezoidal shell with an off-center key, around a tongue; socket and tongue have wide lead-ins."""
+    outline = CrossSection([[(-5.0, -3.0), (5.0, -3.0), (7.0, 3.0), (-7.0, 3.0)]])
+    key, core = _square(2.0, 2.0, 3.0, 3.0), _offset(outline, -1.2)
+    shell = _shaft(outline, -9.0, 6.0) + _shaft(key, -9.0, 6.0)
+    widened = Manifold.batch_hull([_prism(core, -8.4, -8.39), _prism(_offset(core, 0.6), -9.01, -9.0)])
+    plug = shell - _prism(core, -9.01, -1.0) - widened
+    tongue_outline = _offset(core, -clearance)
+    tip = _prism(_offset(tongue_outline, -0.8), -2.01, -2.0)
+    tongue = Manifold.batch_hull([_prism(tongue_outline, -9.5, -2.8), tip])
+    cavity = _hole(outline, clearance, -9.0) + _hole(key, clearance, -9.0)
+    return Part([plug], [_block(28.0, -13.0) - cavity + tongue], clearance)
+
+
 PARTS: dict[str, Callable[[], Part]] = {
     "keyed_peg": keyed_peg,
     "square_peg": square_peg,
@@ -192,5 +261,13 @@ PARTS: dict[str, Callable[[], Part]] = {
     "bayonet": bayonet,
     "snap_fit": snap_fit,
     "dovetail": dovetail,
+    "hexagon": hexagon,
+    "reuleaux_triangle": reuleaux_triangle,
+    "oval": oval,
+    "cross": cross,
+    "l_profile": l_profile,
+    "two_prongs": two_prongs,
+    "four_pins": four_pins,
+    "shell_connector": shell_connector,
 }
 """Functions that return the parts, by name; `screw` is used separately."""

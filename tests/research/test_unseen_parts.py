@@ -34,7 +34,7 @@ def test_easy_parts_are_reported_apart(tmp_path):
             rows = pd.DataFrame({"success": [1, 0] if rate == 0.5 else [int(rate)] * 2, "peak_force": [3.0, 4.0]})
             rows = rows.assign(termination=["success", "collision"], max_commanded_violation=-0.1)
             rows.to_csv(tmp_path / "rows" / policy / f"part{part}.csv", index=False)
-    table, summary = tabulate(tmp_path)
+    table, summary = tabulate(tmp_path / "rows")
     assert list(table["shows_learning"]) == [True, False]
     assert summary["general-0"]["mean"] == 0.75
     assert summary["general-0"]["mean_where_learning_shows"] == 1.0

@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from guiderail.diagrams.envs.options import flat_options
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError, brief
@@ -32,6 +33,7 @@ from guiderail.tools.evaluation.policies import (
     load_policy,
 )
 from guiderail.tools.files import path_exists
+from guiderail.tools.learning.learner import INTERFACE_OPTIONS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, configure
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
@@ -147,7 +149,8 @@ def find_subject(
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` or `as_policy` takes,
             or the name of a baseline policy.
         env: Name of the task, or an environment, that a policy without a run acts in; None for a run.
-        environment: Options of the task's environment that differ from the defaults; unused for a run.
+        environment: Options of the task's environment that differ from the defaults; unused for a run. `guidance` and
+            `observation` are by default those with which a policy of this package was trained.
         trust_policy: True to read a policy file that can execute code.
     """
     if isinstance(policy, os.PathLike):
@@ -158,6 +161,8 @@ def find_subject(
         if str(policy) in known_tasks() and not Path(policy).is_dir():
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
+        if (folder.path / "policy.json").is_file() and not (folder.path / "config.yaml").is_file():
+            raise InputError(f"{policy} is a policy without a run: name the task in which it acts (--task)")
         run_config = folder.config()
         run_config.refuse_changed_task(
             folder.path, "train again; with --task and --env its policy acts in the changed task"
@@ -166,20 +171,39 @@ def find_subject(
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder.path))
-    config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
+    source = find_run(policy) if isinstance(policy, Path | str) else None
+    acting = None
+    if source is not None and (is_policy_file(policy) or (path_exists(source) and source.is_dir())):
+        acting = load_policy(source, trust_policy=trust_policy)
+    config = None if isinstance(env, gymnasium.Env) else _configure(acting, env, environment or {})
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
         digest = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
         if isinstance(act, FunctionPolicy) or (act is policy and not isinstance(act, Policy)):
             return Subject("policy", config, lambda env: act, digest=digest)
         return Subject("policy", config, partial(check_compatible, act), digest=digest)
-    source = find_run(policy)
-    if is_policy_file(policy) or (path_exists(source) and source.is_dir()):
-        make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
+    if source is not None and acting is not None:
+        make_policy = partial(check_compatible, acting)
         return Subject(source.name.replace(":", "."), config, make_policy, digest=policy_digest(source))
     name = str(policy)
     make_policy = partial(_make_compatible, name, make_baselines(config, {}, [name])[name])
     return Subject(name, config, make_policy, digest=name)
+
+
+def _configure(policy: PolicyFn | None, task: str, options: Mapping[str, Any]) -> RunConfig:
+    """Return the configuration of a task for a policy.
+
+    Options on which the meaning of a policy's actions depends have by default the values with which it was trained, if
+    the task accepts them; otherwise `check_compatible` names the difference.
+    """
+    declared = policy.description.get("environment") if isinstance(policy, Policy) else None
+    if isinstance(declared, Mapping):
+        own = {name: declared[name] for name in INTERFACE_OPTIONS if name in declared}
+        try:
+            return configure(task, own | flat_options(options))
+        except InputError:
+            pass
+    return configure(task, options)
 
 
 def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:

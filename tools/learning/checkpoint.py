@@ -16,6 +16,7 @@ from safetensors.numpy import save
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest
 from guiderail.tools.files import write_atomically
+from guiderail.tools.pretrained import find_run
 
 Actor = dict[str, torch.Tensor]
 Entry = TypeVar("Entry")
@@ -129,9 +130,12 @@ def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the state of a run's off-policy learner; without the last episode if it was trained on a robot."""
     from guiderail.tools.learning.run_folder import RunFolder  # imports pandas, which the learners do not need
 
-    file = RunFolder(Path(run)).checkpoint
+    file = RunFolder(find_run(run)).checkpoint
     if not file.is_file():
-        raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
+        raise InputError(
+            f"init_from names {run}, which has no checkpoint: name the folder of a trained run, or let its policy "
+            "demonstrate with --set demonstrator=..."
+        )
     arrays, stored = load_checkpoint(file)
     arrays, values = {k: v for k, v in arrays.items() if not k.startswith("episodes/")}, stored["learner"]
     if "acting" in values:  # trained on a robot, where only the acting process counts the episodes

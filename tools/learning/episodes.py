@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -13,17 +14,42 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.utils import set_random_seed
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
+from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.episode import Callback, PolicyFn, Transition, has_image
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
+from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import new_columns, rollout
 from guiderail.tools.learning.checkpoint import entries_of, load_module, module_arrays, restore_modules
-from guiderail.tools.learning.environment_set import select_environment
+from guiderail.tools.learning.environment_set import EnvironmentSet, select_environment
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
-from guiderail.tools.learning.run_folder import RunConfig
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.pretrained import find_run
 
 Demonstrator = Callable[[gymnasium.Env], PolicyFn]
 """Function from an environment to the policy of a demonstrator."""
+
+
+def make_demonstrator(config: RunConfig) -> Demonstrator | None:
+    """Return the demonstrator of a run: the policy that `demonstrator` names, by default each task's scripted policy.
+
+    Returns:
+        The demonstrator; None if there are no demonstration episodes.
+
+    Raises:
+        InputError: If the policy cannot be read, or a task has no scripted policy.
+    """
+    learner = config.learner
+    if not learner.demonstration_episodes:
+        return None
+    if learner.demonstrator:
+        folder = RunFolder(find_run(learner.demonstrator))
+        return partial(check_compatible, Policy.load(folder.path), learned_in=folder.config().environment)
+    makers = {member.name: make_baseline(member.task, "scripted") for member in config.members}
+    if not makers:
+        return make_baseline(config.task, "scripted")
+    return lambda env: makers[cast("EnvironmentSet", env.unwrapped).current](env)
 
 
 class Episodes:

@@ -24,6 +24,8 @@ from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Callback, has_image
 
+INTERFACE_OPTIONS = ("guidance", "observation")  # options on which the meaning of observation and action depends
+
 LOG_FORMATS = ("tensorboard", "wandb", "csv", "json", "log", "stdout")
 # Columns of an episode's row that are logged, and their names in the log.
 LOGGED_COLUMNS = {
@@ -61,6 +63,7 @@ class LearnerConfig:
             never. Resuming such a run runs no further episodes.
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
+        demonstrator: Run or `pretrained:NAME` whose policy demonstrates; by default the task's scripted policy.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
@@ -76,6 +79,7 @@ class LearnerConfig:
     stop_after_successes: NonNegative = 0
 
     demonstration_episodes = 0
+    demonstrator = ""
     symmetry = cast("Symmetries", False)
     num_envs = 0
 
@@ -196,6 +200,16 @@ def describe_interface(env: gymnasium.Env) -> dict[str, Any]:
     image = getattr(space, "image_shape", None)
     described = {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
     return described | {"action_low": actions.low.tolist(), "action_high": actions.high.tolist()}
+
+
+def describe_policy(config: Any, env: gymnasium.Env) -> dict[str, Any]:
+    """Return the description of a policy for the `RunConfig` of its run and the run's environment.
+
+    `environment` has the options on which the meaning of observation and action depends, so that the policy can act in
+    another task.
+    """
+    options = {key: config.environment[key] for key in INTERFACE_OPTIONS if key in config.environment}
+    return {"task": config.task, **describe_interface(env), "environment": options}
 
 
 def divergence_error() -> InputError:

@@ -18,6 +18,7 @@ from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean, find_plugins
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries, reject_bool
+from guiderail.tools.pretrained import PRETRAINED
 
 DEFAULT_PRESET = "tqc_contact"
 MAX_EPISODES = 10**9  # largest number of episodes of a run
@@ -30,6 +31,10 @@ def _check_ent_coef(ent_coef: str) -> str:
     return ent_coef
 
 
+def _absolute(run: str) -> str:
+    return run if not run or run.startswith(PRETRAINED) else str(Path(run).resolve())
+
+
 # Upper bounds exclude values that would exhaust memory or never finish.
 BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
 NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
@@ -40,7 +45,7 @@ Noise = Annotated[float, Field(ge=0, le=10), BeforeValidator(reject_bool)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
 # The path is made absolute, so that a run can be resumed from another working directory.
-Folder = Annotated[str, AfterValidator(lambda path: path and str(Path(path).resolve()))]
+RunName = Annotated[str, AfterValidator(_absolute)]
 NetArch = Annotated[
     tuple[NumUnits, ...],
     Field(min_length=1, max_length=20),
@@ -66,6 +71,7 @@ class OffPolicyConfig(LearnerConfig):
 
     algorithm: str = "tqc"  # registered name of the learner
     demonstration_episodes: NonNegative = 0  # first episodes, in which a demonstrator acts
+    demonstrator: RunName = ""  # run or pretrained:NAME whose policy demonstrates; default: the scripted policy
     symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
     num_envs: Annotated[NonNegative, Field(le=1024)] = 0  # processes that simulate episodes; 0: only this one
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
@@ -93,11 +99,13 @@ class OffPolicyConfig(LearnerConfig):
     image_encoder: Literal["average_pooling", "convolutional", "pixels"] = "average_pooling"  # features of images
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
-    init_from: Folder = ""  # run whose networks, optimizers, replay buffer and episode count training starts from
+    init_from: RunName = ""  # run whose networks, optimizers, replay buffer and episode count training starts from
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
             raise InputError("demonstration_fraction needs demonstrations: give --set demonstration_episodes=... too")
+        if self.demonstrator and not self.demonstration_episodes:
+            raise InputError("demonstrator acts in the demonstrations: give --set demonstration_episodes=... too")
         if self.init_from and self.demonstration_episodes:
             raise InputError("demonstration_episodes does not work with init_from: leave one of them out")
         if self.device == "cuda" and self.num_envs:

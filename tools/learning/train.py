@@ -20,12 +20,11 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, register_environment, task_named, warn_of_deviation
-from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
 from guiderail.tools.evaluation.subject import counts_collisions
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.environment_set import EnvironmentSet, Variants, find_members, load_variants
+from guiderail.tools.learning.environment_set import Variants, find_members, load_variants
 from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.learner_config import OffPolicyConfig
 from guiderail.tools.learning.run_folder import (
@@ -218,7 +217,7 @@ class Training:
         """Train with a progress bar, and draw the learning curve and the replay page.
 
         A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes.
-        The task's scripted policy acts in the learner's `demonstration_episodes`.
+        The learner's `demonstrator`, by default the task's scripted policy, acts in its `demonstration_episodes`.
         """
         imports, formats = import_modules(self.imports), check_log_formats(self.log)
         folder = RunFolder(self.out)
@@ -227,9 +226,11 @@ class Training:
             if "demonstrations" in self.environment or any(map(is_task_folder, imports)):
                 warn_of_deviation(config.resolved)
             warn_of_unfinished_source(config)
-        from guiderail.tools.learning.trainer import Observers, run_training  # imports PyTorch: slow, so after checks
+        # These import PyTorch: slow, so after the checks.
+        from guiderail.tools.learning.episodes import make_demonstrator
+        from guiderail.tools.learning.trainer import Observers, run_training
 
-        demonstrator = _make_demonstrator(config) if config.learner.demonstration_episodes else None
+        demonstrator = make_demonstrator(config)
         supervise = self.open_supervision() if config.human_in_the_loop and self.open_supervision is not None else None
         label = f"{len(config.members)} environments" if config.members else config.task
         with EpisodeProgress(config.episodes, name=label) as progress:
@@ -263,20 +264,12 @@ class Training:
         num_demonstrated = config.learner.demonstration_episodes
         if isinstance(config.learner, OffPolicyConfig) and num_demonstrated >= config.episodes:
             _LOGGER.warning(
-                "the scripted policy acts in every episode and the learned one in none, because demonstration_episodes "
+                "the demonstrator acts in every episode and the learned one in none, because demonstration_episodes "
                 "is %d: give more than %d episodes",
                 num_demonstrated,
                 num_demonstrated,
             )
         return config
-
-
-def _make_demonstrator(config: RunConfig) -> MakePolicy:
-    """Return the function that makes the scripted policy of an environment's task; see `make_baseline` for errors."""
-    makers = {member.name: make_baseline(member.task, "scripted") for member in config.members}
-    if not makers:
-        return make_baseline(config.task, "scripted")
-    return lambda env: makers[cast(EnvironmentSet, env.unwrapped).current](env)
 
 
 def draw_pictures(out: Path) -> dict[str, str]:

@@ -34,7 +34,7 @@ from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
     LearningLog,
-    describe_interface,
+    describe_policy,
     divergence_error,
     learner_arguments,
 )
@@ -98,7 +98,10 @@ def run_training(
             episodes = Episodes(config, make_run_environment(config), demonstrator)
         stack.callback(lambda: episodes.close())
         env = episodes.env
-        if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
+        number = config.learner.demonstration_episodes
+        if demonstrator is not None and config.learner.demonstrator:
+            demonstrator(env)  # raises an InputError that names the difference
+        elif demonstrator is not None and number and not is_compatible(demonstrator, env):
             raise InputError(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
@@ -334,7 +337,7 @@ class TrainingLoop:
         config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
         try:
             with _naming_failures(config, name, ValueError):
-                policy = self._learner.policy({"task": config.task, **describe_interface(self._episodes.env)})
+                policy = self._learner.policy(describe_policy(config, self._episodes.env))
         except InputError:
             raise
         except ValueError as error:

@@ -1,4 +1,6 @@
-"""Trained policies that come with the package: run folders without a checkpoint, named `pretrained:NAME`.
+"""Trained policies that come with the package, named `pretrained:NAME`: run folders without a checkpoint.
+
+`pretrained:insertion` has no configuration either, because it acts in tasks that it was not trained in (`--task`).
 
 `make pretrained` trains and evaluates them again (`research/pretrained.py`).
 """
@@ -14,11 +16,11 @@ PRETRAINED_FOLDER = Path(__file__).parent
 
 def pretrained_names() -> list[str]:
     """Return the names of the policies that come with the package."""
-    return sorted(file.parent.name for file in PRETRAINED_FOLDER.glob("*/config.yaml"))
+    return sorted(file.parent.name for file in PRETRAINED_FOLDER.glob("*/policy.json"))
 
 
 def find_run(source: str | Path) -> Path:
-    """Return the folder of a run; that of `pretrained:NAME` is in the package."""
+    """Return the folder of a run or a policy; that of `pretrained:NAME` is in the package."""
     if not str(source).startswith(PRETRAINED):
         return Path(source)
     name = str(source).removeprefix(PRETRAINED)

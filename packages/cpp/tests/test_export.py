@@ -1,5 +1,6 @@
 """Exported folder: it builds, replays its recording, and runs as a controller and a node with a double of ROS 2."""
 
+import functools
 import json
 import shutil
 import subprocess
@@ -18,58 +19,76 @@ needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there i
 HERE = Path(__file__).parent
 
 
-def compile_program(folder, source, program, *options):
-    command = ["g++", "-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *options]
-    subprocess.run([*command, "-I", folder / "include", source, "-o", program], check=True)
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Return a function that exports a pretrained skill once and returns its folder."""
+    root = tmp_path_factory.mktemp("skills")
+
+    @functools.cache
+    def export(name):
+        export_cpp(f"pretrained:{name}", root / name)
+        return root / name
+
+    return export
+
+
+@pytest.fixture(scope="module")
+def compiled(exported, tmp_path_factory):
+    """Return a function that compiles a program once with the headers of the connector and returns its path.
+
+    The headers are the same in every export; `skill.safetensors` has all that differs.
+    """
+    root = tmp_path_factory.mktemp("programs")
+
+    @functools.cache
+    def compile_program(source, *options):
+        command = ["g++", "-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *options]
+        program = root / source.stem
+        subprocess.run([*command, "-I", exported("connector") / "include", source, "-o", program], check=True)
+        return program
+
+    return compile_program
+
+
+def run(program, *files):
+    result = subprocess.run([program, *files], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["connector", "passage", "clamp", "pouring"])
-def test_exported_skill_replays_the_commands_of_its_environment(name, tmp_path):
-    folder = tmp_path / "skill"
-    export_cpp(f"pretrained:{name}", folder)
-    compile_program(folder, folder / "test/replay.cpp", tmp_path / "replay")
-    command = [tmp_path / "replay", folder / "skill.safetensors", folder / "test/recording.safetensors"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
+def test_exported_skill_replays_the_commands_of_its_environment(name, exported, compiled):
+    folder, shared = exported(name), exported("connector")
+    for file in [*(shared / "include").rglob("*.hpp"), shared / "test/replay.cpp"]:
+        assert (folder / file.relative_to(shared)).read_bytes() == file.read_bytes()
+    program = compiled(shared / "test/replay.cpp")
+    run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
-def test_controller_and_node_run_the_skill_with_a_double_of_ros2(tmp_path):
-    folder = tmp_path / "skill"
-    export_cpp("pretrained:connector", folder)
-    includes = ["-I", HERE / "ros2_double", "-I", folder / "ros2/src"]
-    compile_program(folder, HERE / "ros2_test.cpp", tmp_path / "ros2_test", *includes)
-    command = [tmp_path / "ros2_test", folder / "skill.safetensors", folder / "test/recording.safetensors"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
+def test_controller_and_node_run_the_skill_with_a_double_of_ros2(exported, compiled):
+    folder = exported("connector")
+    program = compiled(HERE / "ros2_test.cpp", "-I", HERE / "ros2_double", "-I", folder / "ros2/src")
+    run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
-def test_runner_survives_wrong_measurements_and_keeps_its_limits(tmp_path):
-    folder = tmp_path / "skill"
-    export_cpp("pretrained:connector", folder)
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
-    command = [tmp_path / "runner_test", folder / "skill.safetensors", folder / "test/recording.safetensors"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
+def test_runner_survives_wrong_measurements_and_keeps_its_limits(exported, compiled):
+    folder = exported("connector")
+    program = compiled(HERE / "runner_test.cpp", *SANITIZERS)
+    run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
-def test_damaged_template_is_refused_when_it_is_read(tmp_path):
-    folder = tmp_path / "skill"
-    export_cpp("pretrained:pouring", folder)
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
-    command = [tmp_path / "runner_test", folder / "skill.safetensors"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
+def test_damaged_template_is_refused_when_it_is_read(exported, compiled):
+    run(compiled(HERE / "runner_test.cpp", *SANITIZERS), exported("pouring") / "skill.safetensors")
 
 
-def test_description_lists_signals_and_action(tmp_path):
-    export_cpp("pretrained:clamp", tmp_path / "skill")
-    skill = json.loads((tmp_path / "skill/skill.json").read_text())
+def test_description_lists_signals_and_action(exported):
+    skill = json.loads((exported("clamp") / "skill.json").read_text())
     assert skill["signals"] == {"pose": 3, "wrench": 3}
     assert skill["frames"] == ["hole"]
     assert [entry["name"] for entry in skill["action"]] == ["input 0", "input 1", "input 2"]

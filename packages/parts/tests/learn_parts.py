@@ -1,4 +1,4 @@
-"""Benchmark of six parts without tuned parameters: create their tasks, train and evaluate by the command line.
+"""Benchmark of the drawn parts without tuned parameters: create their tasks, train and evaluate by the command line.
 
 Run `python packages/parts/tests/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60]
 [--held-out 100] [--seed 0] [--processes 2]`. With `--episodes 0` the tasks are only created. The same command

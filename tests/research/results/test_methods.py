@@ -86,7 +86,7 @@ HEADER = (
 
 
 def test_table_has_the_last_evaluation_of_each_seed(tmp_path):
-    (tmp_path / "peers_connector_hard.csv").write_text(
+    (tmp_path / "connector_hard_converged.csv").write_text(
         HEADER
         + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1,0\n"
         + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,3,1\n"
@@ -102,7 +102,7 @@ def test_table_has_the_last_evaluation_of_each_seed(tmp_path):
     effort = "60 (1); residual RL: 60 (2)"
     # Residual RL: 3 of 200 held-out episodes have violations (1.5 %), 7 of 120 training episodes were stopped (6 %).
     assert row == [
-        "Connector, hard, contact at 10 ms",
+        "Connector, hard, converged contact",
         "KGRL 97 (one seed)",
         "99 (98–100)",
         "– / –",
@@ -114,13 +114,13 @@ def test_table_has_the_last_evaluation_of_each_seed(tmp_path):
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
     template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2,0\n"
-    rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_cbf": (0.1, 0.2, 0.3, 0.4)}
+    rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "safe_residual": (0.1, 0.2, 0.3, 0.4)}
     lines = [template.format(name, seed, rate) for name, values in rates.items() for seed, rate in enumerate(values)]
-    (tmp_path / "peers_connector_hard.csv").write_text(HEADER + "".join(lines))
+    (tmp_path / "connector_hard_converged.csv").write_text(HEADER + "".join(lines))
     text = task_table("BncConnector", tmp_path)
     assert [row[2].split(" (")[0] for row in rows(text)] == ["100", "90", "25"]
     # KGRL is better in 10 of the 16 pairs of seeds, and equal in 5: (10 + 5 / 2) / 16 = 0.78.
-    assert "A seed of KGRL succeeds more often than one of residual RL with probability 0.78 (95 %: " in text
+    assert "a seed succeeds more often than one of residual RL: KGRL 0.78 (95 %: " in text
     assert "equal knowledge" not in text
 
 
@@ -132,11 +132,22 @@ def test_fewer_than_five_seeds_have_no_interval(num_seeds, cell, tmp_path):
         for name, rate in (("kgrl", 1.0), ("residual", 0.5))
         for seed in range(num_seeds)
     ]
-    (tmp_path / "peers_connector_hard.csv").write_text(HEADER + "".join(lines))
+    (tmp_path / "connector_hard_converged.csv").write_text(HEADER + "".join(lines))
     text = task_table("BncConnector", tmp_path)
     assert rows(text)[0][2] == cell
-    interval = "95 %: 1.00–1.00; " if num_seeds == 5 else ""
-    assert f"residual RL with probability 1.00 ({interval}ties count half)" in text
+    interval = " (95 %: 1.00–1.00)" if num_seeds == 5 else ""
+    assert f"residual RL: KGRL 1.00{interval}." in text
+
+
+def test_brief_table_has_success_stops_and_violations(tmp_path):
+    (tmp_path / "peers_connector_hard.csv").write_text(
+        HEADER
+        + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,3,1\n"
+        + "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,3,0\n"
+    )
+    text = task_table("BncConnector", tmp_path)
+    assert "| method | held-out success [%] | stopped in training [%] | max. commanded violation |" in text
+    assert rows(text)[1][1:] == ["98 (one seed)", "7", "0.40 mm, in 8 episodes"]
 
 
 def test_knowledge_lists_demonstrated_episodes_when_unequal():
@@ -185,7 +196,16 @@ def test_results_with_a_constant_offset_are_marked():
     assert "†" not in "".join(table["Connector, hard, contact at 10 ms"])
     (clamp,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp")
     (sentence,) = offsets(clamp, TABLES)
-    assert "held-out episodes: RL-SCT; residual RL; RL of 6D velocities. A new hidden offset" in sentence
+    assert sentence.endswith(
+        "held-out episodes: learned methods. A new one in every held-out episode: baseline policies."
+    )
+    sensing, *_ = SECTIONS["GridClamp"]
+    assert offsets(sensing, TABLES) == ["One hidden offset for each seed, in training and in held-out episodes."]
+    (named,) = offsets(Section("Two studies", [*sensing.rows[-1:], *clamp.rows[:4]]), TABLES)
+    assert named.endswith(
+        "episodes: scripted policy; RL-SCT; residual RL; RL of 6D velocities. A new one in every held-out "
+        "episode: zero action."
+    )
     assert offsets(SECTIONS["BncConnector"][0], TABLES) == []
 
 

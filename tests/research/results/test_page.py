@@ -44,19 +44,28 @@ def test_page_has_one_row_for_a_method_and_no_seeds(connector_study, tmp_path):
     assert "| sKGRL | 98 (97–100) |" in page
     assert "guiderail study research/studies/NAME.yaml --out studies" in page
     assert "- `connector`, not run: skgrl, seeds 32–34; kgrl" in page
+    assert "| `connector` |" not in page
 
 
-def test_evaluation_sets_are_columns_of_a_method(connector_study, tmp_path):
-    table = read_table(connector_study / "connector.csv")
-    elsewhere = table.assign(eval_set="elsewhere", success_rate=0.5, episodes=20)
-    write_table(
-        tmp_path / "both" / "connector", pd.concat([table.assign(method="other"), elsewhere.assign(method="other")])
-    )
+def test_evaluation_sets_are_in_the_row_of_a_method(connector_study, tmp_path):
+    table = read_table(connector_study / "connector.csv").assign(method="other")
+    elsewhere = table.assign(eval_set="elsewhere", success_rate=0.5, max_commanded_violation=4e-4, violating_episodes=2)
+    for episodes, cells in (
+        (100, "gantry: 98 (97–100); elsewhere: 50"),
+        (20, "gantry: 98 (97–100); elsewhere: 50, of 20 each"),
+    ):
+        both = pd.concat([table, elsewhere.assign(episodes=episodes)])
+        write_table(tmp_path / "both" / "connector", both[both["training_episodes"].notna()])
+        page = write_results([tmp_path / "both"], tmp_path / "results")
+        assert f"| `connector` | other | 40 (30, 31) | {cells} | 0.40 mm, in 4 episodes |" in page
+
+
+def test_equal_numbers_of_episodes_are_stated_once(connector_study, tmp_path):
+    table = read_table(connector_study / "connector.csv").assign(method="other", episodes=20)
+    both = pd.concat([table, table.assign(eval_set="elsewhere", success_rate=0.5)])
+    write_table(tmp_path / "both" / "connector", both[both["training_episodes"].notna()])
     page = write_results([tmp_path / "both"], tmp_path / "results")
-    assert (
-        "| held-out success [%] of | training episodes (seeds) | gantry | elsewhere | max. commanded violation |"
-        in page
-    )
+    assert "| gantry: 98 (97–100); elsewhere: 50; of 20 each | none |" in page
 
 
 def test_differences_of_each_study_are_a_table(connector_study, tmp_path):
@@ -85,8 +94,8 @@ def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     assert "](pouring_sweep.svg)" in page
     assert "| success below 90% at | mug offset [mm], 0 to 60 |" in page
     assert "| rl_sct | 30 |" in page
-    assert "| uniform_random | from the easiest on |" in page
-    assert "| uniform_random | – |" not in page
+    assert "Below 90% at every value: uniform_random." in page
+    assert "| uniform_random |" not in page
     assert ", not run: " in page
     write_results([], tmp_path / "results")
     assert picture.read_bytes() == content
@@ -98,9 +107,9 @@ def test_smoothness_table_has_the_selected_columns(tmp_path):
     rows = [row, row | {"place": "connector", "peak_force": 3.0}, row | {"method": "gSDE"}]
     write_table(tmp_path / "study" / "smoothness", pd.DataFrame(rows))
     page = write_results([tmp_path / "study"], tmp_path / "results")
-    assert "Numbers: free / connector." in page
-    assert "| KGRL |" + " 0.25 / 0.25 |" * 3 + " 0.25 / 3 |" in page
-    assert "| gSDE |" + " 0.25 |" * 4 in page
+    assert "Place: connector; other places in the table: free." in page
+    assert "| KGRL |" + " 0.25 |" * 3 + " 3 |" in page
+    assert "gSDE" not in page
     assert "ldlj" not in page
 
 

@@ -171,6 +171,7 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
     ("settings", "message"),
     [
         ({"demonstration_fraction": 0.5}, "needs demonstrations: give --set demonstration_episodes"),
+        ({"demonstrator": "runs/a"}, "demonstrator acts in the demonstrations: give --set demonstration_episodes"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),

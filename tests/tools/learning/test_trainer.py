@@ -106,6 +106,25 @@ def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_policy_of_a_run_demonstrates(bead_config, bead_run, tmp_path):
+    config = with_demonstrations(bead_config, 2)
+    config = replace(config, learner=replace(config.learner, demonstrator=str(bead_run)))
+    env, policy = trainer.make_run_environment(config), Policy.load(bead_run)
+    observation, _ = env.reset(seed=0)
+    demonstrator = episodes.make_demonstrator(config)
+    np.testing.assert_array_equal(demonstrator(env)(observation), policy(observation))
+    rows = run_training(RunFolder(tmp_path / "demonstrated"), config, demonstrator=demonstrator)
+    assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
+
+
+def test_demonstrating_run_of_another_environment_is_refused_by_the_difference(bead_config, bead_run, tmp_path):
+    config = with_demonstrations(bead_config, 1)
+    config = replace(config, learner=replace(config.learner, demonstrator="pretrained:passage"))
+    with pytest.raises(InputError, match=r"the policy takes observations .* and this environment has observations"):
+        run_training(RunFolder(tmp_path / "demonstrated"), config, demonstrator=episodes.make_demonstrator(config))
+    assert not (tmp_path / "demonstrated").exists()
+
+
 def test_killed_run_resumes_bit_for_bit(bead_config, bead_run, forkserver, tmp_path):
     killed = RunFolder(tmp_path / "killed")
     receiver, sender = FORKS.Pipe(duplex=False)

@@ -7,7 +7,7 @@ from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.learner import LearnerConfig, NonNegative, Positive, Symmetries
-from guiderail.tools.learning.learner_config import BatchSize, Fraction, NetArch, Noise, Rate
+from guiderail.tools.learning.learner_config import BatchSize, Fraction, NetArch, Noise, Rate, RunName
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -18,6 +18,7 @@ class BcConfig(LearnerConfig):
 
     algorithm: str = "bc"
     demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
+    demonstrator: RunName = ""  # run or pretrained:NAME whose policy demonstrates; default: the scripted policy
     symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
     learning_rate: Rate = 1e-3
     gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration

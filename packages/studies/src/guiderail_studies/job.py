@@ -275,13 +275,13 @@ def _train(job: Job, episodes: int, source: str) -> pd.DataFrame:
         return pd.DataFrame()
     folder, copy = job.folder, job.policy_folder(episodes)
     if _needs_training(job, episodes):
+        from guiderail.tools.learning.episodes import make_demonstrator
         from guiderail.tools.learning.trainer import run_training
 
         is_resumed = (folder.path / "config.yaml").exists()
         config = job.config(max(episodes, folder.num_saved_episodes()))
         config = replace(config, source=folder.config().source if is_resumed else source)
-        demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
-        run_training(folder, config, resume=is_resumed, demonstrator=demonstrator)
+        run_training(folder, config, resume=is_resumed, demonstrator=make_demonstrator(config))
     rows = folder.episodes()
     if len(rows) < episodes:
         raise InputError(
