@@ -264,12 +264,6 @@ class LcNsKmp:
         """Return the largest displacement (O,) of a step's output by a correction of norm one."""
         return self._factor(step).output_sizes()
 
-    def factor_all(self) -> int:
-        """Factor every step in advance, and return `cached_bytes`."""
-        for step in range(self.num_steps):
-            self._factor(step)
-        return self.cached_bytes
-
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """Check the arguments and return x = [history, null-space action]."""
         action = self._no_action if null_space_action is None else as_doubles(null_space_action, "a null-space action")
