@@ -26,7 +26,7 @@ WITH_HANDLERS = (
 SLOW = (
     "parts/tests/test_create_task.py", "calibration/tests/test_calibrate.py", "docs/test_tutorials.py",
     "third_party/test_peglab.py", "cpp/tests/test_export.py", "cpp/tests/test_laws.py", "robot/test_train.py",
-    "diagrams/tasks/test_contact_probe.py", "parts/tests/test_batch.py", "docs/test_notebooks.py",
+    "studies/tests/test_contact_probe.py", "parts/tests/test_batch.py", "docs/test_notebooks.py",
 )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .command_checks import CommandFilter as CommandFilter
 from .command_checks import CommandWatchdog as CommandWatchdog
 from .command_checks import ConstraintViolation as ConstraintViolation
-from .contact_detector import ContactDetector as ContactDetector
 from .disturbances import CommandDisturbance as CommandDisturbance
 from .disturbances import SensorDisturbance as SensorDisturbance
 from .episode_terms import EpisodeMonitor as EpisodeMonitor
@@ -44,6 +43,7 @@ from .wrench_sensors import JointTorqueErrors as JointTorqueErrors
 from .wrench_sensors import JointTorqueWrench as JointTorqueWrench
 from .wrench_sensors import WrenchSensor as WrenchSensor
 from .wrench_signals import CenterOfPressure as CenterOfPressure
+from .wrench_signals import ContactDetector as ContactDetector
 from .wrench_signals import ForceMonitor as ForceMonitor
 from .wrench_signals import MeanContactPoint as MeanContactPoint
 from .wrench_signals import MeanForce as MeanForce

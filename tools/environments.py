@@ -21,7 +21,6 @@ from guiderail.diagrams.envs.options import (
     flat_options,
     kernel_from_options,
     option_fields,
-    validate_options,
 )
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
@@ -114,12 +113,6 @@ def resolve_environment(task: str, arguments: Mapping[str, Any]) -> Any:
 def flat_environment(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a task's environment with entries of structured options as options; see `flat_options`."""
     return flat_options(options, TASKS.get(task).model_fields) if task in TASKS.names() else dict(options)
-
-
-def check_reset(task: str, options: Mapping[str, Any]) -> None:
-    """Raise an InputError if a reset option of a guiderail task is invalid; other tasks are not checked."""
-    if task in TASKS.names():
-        validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
 def warn_of_deviation(config: Any) -> None:

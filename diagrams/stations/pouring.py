@@ -27,9 +27,9 @@ from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
-from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.poses import MeasuredPose, RelativePoses
 from guiderail.systems.wrench_sensors import WrenchSensor
+from guiderail.systems.wrench_signals import ContactDetector
 
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])

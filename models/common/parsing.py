@@ -2,12 +2,12 @@
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
 
-from pydrake.multibody.parsing import ModelDirective, ModelDirectives, PackageMap, Parser, ProcessModelDirectives
+from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
@@ -29,8 +29,8 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
     Raises:
         InputError: If the file is of another type, or the file or one of its meshes cannot be read.
     """
-    with _allow_package_map():
-        parser = _make_parser(plant)
+    with allow_package_map():
+        parser = local_parser(plant)
         if str(path).startswith(_OWN_URL):
             path = _MODELS / str(path).removeprefix(_OWN_URL)
         _refuse_crossed_limits(Path(path))
@@ -98,28 +98,8 @@ def _to_float(text: str | None) -> float:
         return math.nan
 
 
-def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective], folder: Path | None = None) -> None:
-    """Add the models of Drake model directives to a plant.
-
-    The directives name files by absolute paths (file://), in the package `guiderail`, which has the models of this
-    package (package://guiderail/robots/iiwa14.urdf), or in a package (folder with a `package.xml`) in `folder`.
-
-    Raises:
-        InputError: If the directives cannot be processed.
-    """
-    try:
-        with _allow_package_map():
-            parser = _make_parser(plant)
-            if folder is not None:
-                parser.package_map().PopulateFromFolder(str(folder.resolve()))
-            ProcessModelDirectives(ModelDirectives(directives=list(directives)), parser)
-    except (RuntimeError, SystemExit) as error:
-        words = " ".join(str(error).split())
-        raise InputError(f"the model directives can't be processed: {words}") from error
-
-
-def _make_parser(plant: MultibodyPlant) -> Parser:
-    """Return a parser without the package `drake_models`, whose files Drake would download."""
+def local_parser(plant: MultibodyPlant) -> Parser:
+    """Return a parser without the package `drake_models`, whose files Drake would download; see `allow_package_map`."""
     parser = Parser(plant)
     parser.package_map().Remove("drake_models")
     parser.package_map().Add("guiderail", str(_MODELS))
@@ -127,7 +107,7 @@ def _make_parser(plant: MultibodyPlant) -> Parser:
 
 
 @contextmanager
-def _allow_package_map() -> Iterator[None]:
+def allow_package_map() -> Iterator[None]:
     """Allow Drake's `Parser` to register the remote package `drake_models`; nothing is downloaded.
 
     The constructor of the parser registers this package, and raises an error if DRAKE_ALLOW_NETWORK forbids it.

@@ -29,10 +29,8 @@ SIBLINGS = {
     "parts": ("create-task", "create-tasks"),
     "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark"),
     "data": ("dataset", "template"),
-    "lerobot": (
-        "learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy", "guidance:kgrl_base_policy",
-        "guidance:residual_base_policy",
-    ),
+    "lerobot": ("learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy",
+                "guidance:kgrl_base_policy", "guidance:residual_base_policy"),
     "mujoco": ("station:mujoco",),
     "cpp": ("export",),
     "calibration": ("calibrate", "probe"),

@@ -9,8 +9,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
-
 
 def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
     """Return points (N, 3) [m] from cylindrical coordinates about z, or one point (3,) from three numbers.
@@ -54,28 +52,6 @@ class TriangleMesh:
         triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
         has_area = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
         return TriangleMesh(vertices, triangles[has_area])
-
-    @staticmethod
-    def from_obj(path: Path) -> "TriangleMesh":
-        """Read the vertices and triangles of an OBJ file with triangular faces, such as a file written with `to_obj`.
-
-        Raises:
-            InputError: If a vertex is not three numbers, there is no face, a face is not three whole numbers, or a
-                vertex number of a face is less than 1 or more than the number of vertices. Negative numbers, which
-                count from the last vertex, are not supported.
-        """
-        lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
-        vertices = [line[1:4] for line in lines if line[:1] == ["v"]]
-        corners = [[corner.split("/")[0] for corner in line[1:]] for line in lines if line[:1] == ["f"]]
-        try:
-            points, triangles = np.array(vertices, dtype=float), np.array(corners, dtype=int)
-        except (ValueError, OverflowError):
-            points = triangles = np.empty(0)
-        if points.shape[1:] != (3,) or triangles.shape[1:] != (3,):
-            raise InputError(f"{path} must hold vertices of three numbers, and triangles only: export it as triangles")
-        if ((triangles < 1) | (triangles > len(vertices))).any():
-            raise InputError(f"a face of {path} has a vertex outside 1 … {len(vertices)}: number the vertices from 1")
-        return TriangleMesh(points, triangles - 1)
 
     def normals(self) -> np.ndarray:
         """Return the unit normals (T, 3) of the triangles."""

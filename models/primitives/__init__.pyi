@@ -1,6 +1,7 @@
 from .constraints import LinearConstraints as LinearConstraints
 from .demonstrations import Demonstrations as Demonstrations
 from .demonstrations import align_demonstrations as align_demonstrations
+from .demonstrations import pose_demonstrations as pose_demonstrations
 from .kernels import Kernel as Kernel
 from .kernels import Matern52 as Matern52
 from .kernels import SquaredExponential as SquaredExponential
@@ -8,7 +9,6 @@ from .kernels import make_kernel as make_kernel
 from .kernels import register_kernel as register_kernel
 from .kmp import Kmp as Kmp
 from .lc_ns_kmp import LcNsKmp as LcNsKmp
-from .poses import pose_demonstrations as pose_demonstrations
 from .poses import pose_outputs as pose_outputs
 from .poses import pose_rotation as pose_rotation
 from .promp import ProMp as ProMp

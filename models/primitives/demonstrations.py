@@ -10,7 +10,7 @@ import numpy as np
 from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
-from guiderail.models.primitives.full_turns import without_jumps
+from guiderail.models.primitives.poses import POSE_NAMES, Orientation, pose_outputs, without_jumps
 
 MAX_STEPS = 20_000  # largest number of control steps of a motion: 20 s at 1 kHz, 400 s at 50 Hz
 MAX_MAGNITUDE = 1e100  # largest absolute value; covariances, which are products of two outputs, must not overflow
@@ -345,3 +345,30 @@ def compute_bounds(
         lower[k, indices], upper[k, indices] = (low - margins)[indices], (high + margins)[indices]
     rates = [np.abs(np.diff(y, axis=0) / np.diff(t)[:, None]).max(axis=0) for t, y in samples]
     return DemonstratedBounds(demonstrations.names, starts, lower, upper, np.max(rates, axis=0))
+
+
+def pose_demonstrations(
+    times: Sequence[np.ndarray],
+    positions: Sequence[np.ndarray],
+    quaternions_wxyz: Sequence[np.ndarray],
+    target_position: np.ndarray | None = None,
+    target_quaternion_wxyz: np.ndarray | None = None,
+    orientation: Orientation = "euler_zyx",
+) -> Demonstrations:
+    """Build demonstrations of six outputs from recorded end-effector poses.
+
+    Args:
+        times: M arrays (N_m,) [s].
+        positions: p_WE, M arrays (N_m, 3) [m], in any common frame W.
+        quaternions_wxyz: R_WE, M arrays (N_m, 4).
+        target_position: p_WT (3,) [m]; each demonstration's last position by default (thesis, section 4.4.2).
+        target_quaternion_wxyz: R_WT (4,); each demonstration's last orientation by default.
+        orientation: As in `pose_outputs`.
+    """
+    outputs: list[np.ndarray] = []
+    for p, q in zip(positions, quaternions_wxyz, strict=True):
+        target_p = p[-1] if target_position is None else target_position
+        target_q = q[-1] if target_quaternion_wxyz is None else target_quaternion_wxyz
+        near = outputs[0][0, 3:] if outputs else None
+        outputs.append(pose_outputs(p, q, target_p, target_q, orientation, near))
+    return Demonstrations(times, outputs, POSE_NAMES[orientation])

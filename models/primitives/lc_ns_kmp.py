@@ -22,11 +22,19 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.deviation import MAX_DEVIATION, check_constraints, check_deviation
-from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential, check_kernel
 from guiderail.models.primitives.qp import UnsolvableError
 from guiderail.models.primitives.reference import ReferenceTrajectory
-from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
+from guiderail.models.primitives.window import (
+    BatchPrediction,
+    Modification,
+    Prediction,
+    StepFactor,
+    Window,
+    WindowFeatures,
+    window_features,
+    window_interpolation,
+)
 
 HISTORY, HORIZON = 10, 40
 """Default numbers of past outputs P of sKGRL, and of future points H with constraints."""
@@ -255,12 +263,6 @@ class LcNsKmp:
     def output_sizes(self, step: int) -> np.ndarray:
         """Return the largest displacement (O,) of a step's output by a correction of norm one."""
         return self._factor(step).output_sizes()
-
-    def factor_all(self) -> int:
-        """Factor every step in advance, and return `cached_bytes`."""
-        for step in range(self.num_steps):
-            self._factor(step)
-        return self.cached_bytes
 
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """Check the arguments and return x = [history, null-space action]."""

@@ -14,13 +14,14 @@ from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
-from guiderail.diagrams.tasks.contact_probe import SPEEDS, probe_contact
+from guiderail.diagrams.tasks.contact_probe import SPEEDS
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector import FRICTION, BncDimensions
 from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.systems.recorder import Recording
 from guiderail.tools.visualization.figures import legend, new_figure, save_figure
+from guiderail_studies.contact_probe import probe_contact
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 

@@ -27,12 +27,11 @@ from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController
-from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.poses import MeasuredPose
 from guiderail.systems.recorder import Recorder
 from guiderail.systems.support.last_valid import LastValidPose
 from guiderail.systems.wrench_sensors import WrenchSensor
-from guiderail.systems.wrench_signals import ForceMonitor, PoseWrench
+from guiderail.systems.wrench_signals import ContactDetector, ForceMonitor, PoseWrench
 from research.benchmarks import with_progress
 
 # Timed callbacks. The time of a callback inside another timed callback counts only for the outer callback.

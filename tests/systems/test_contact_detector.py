@@ -16,7 +16,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.systems.contact_detector import ContactDetector
+from guiderail.systems.wrench_signals import ContactDetector
 
 STEP = 2.0**-9  # of the plant and of the detector [s]
 RADIUS = 0.02  # of the ball [m]

@@ -134,7 +134,6 @@ def find_broken(key: str) -> dict[str, str]:
 
 
 CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
-    "templates": _names("guiderail.models.templates.schema:shipped_templates"),
     "log_formats": _names("guiderail.tools.learning.learner:LOG_FORMATS"),
     "pictures": _names("guiderail.tools.files:PICTURES"),
     "videos": _names("guiderail.tools.files:VIDEOS"),
@@ -275,7 +274,6 @@ Subject = Annotated[
         "RUN|POLICY|TASK",
     ),
 ]
-Demonstrations = Annotated[Path, argument("Demonstrations: .npz, .csv or a folder of them.", "FILE")]
 Seed = Annotated[int, option("Seed of the first held-out episode; episode i has seed + i.")]
 Env = Annotated[
     list[str] | None,
@@ -288,18 +286,16 @@ Env = Annotated[
 ]
 
 
-def _import_option(content: str) -> Any:
+def import_option(content: str) -> Any:
     """Return the option --import for modules that register `content`."""
     return option(f"Module or file (.py) that registers {content}.", "--import", metavar="MODULE")
 
 
 Imports = Annotated[
     list[str] | None,
-    _import_option("a task, guidance, a station or a learner; a run stores the module's name or the file's path"),
+    import_option("a task, guidance, a station or a learner; a run stores the module's name or the file's path"),
 ]
-TaskImports = Annotated[list[str] | None, _import_option("the task")]
-HardwareImports = Annotated[list[str] | None, _import_option("a robot or a driver")]
-TemplateImports = Annotated[list[str] | None, _import_option("parts of templates")]
+TaskImports = Annotated[list[str] | None, import_option("the task")]
 
 
 def _trust(context: typer.Context, value: bool) -> bool:

@@ -23,10 +23,9 @@ from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import LONG, MIN_DEMONSTRATIONS, Selection, fit
-from guiderail.models.primitives.full_turns import Orientation, orientation_of_names
 from guiderail.models.primitives.gains import authority_gains, check_action_scale, deviation, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
-from guiderail.models.primitives.poses import check_orientation
+from guiderail.models.primitives.poses import Orientation, check_orientation, orientation_of_names
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.tools.guided.segment import Frame, Segment, as_bool
 

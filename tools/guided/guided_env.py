@@ -18,9 +18,8 @@ from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.laws.law import Command, Law
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
-from guiderail.models.primitives.poses import check_orientation
+from guiderail.models.primitives.poses import Orientation, check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.tools.guided.guide import (
     Guide,

@@ -16,8 +16,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
 from guiderail.models.primitives.demonstrations import MAX_STEPS, DemonstratedBounds, num_periods
-from guiderail.models.primitives.full_turns import Orientation, continued_angles, continued_vectors
-from guiderail.models.primitives.poses import pose_rotation
+from guiderail.models.primitives.poses import Orientation, continued_angles, continued_vectors, pose_rotation
 
 MIN_PERIODS = 4  # minimum duration of a segment's demonstrations [control periods]
 MIN_STEPS = 12  # minimum control steps of a segment, for the fit of the Gaussian mixture

@@ -194,22 +194,6 @@ class RunFolder:
         """Raise an InputError if the folder holds anything but hidden files."""
         refuse_existing_run(self.path)
 
-    def refuse_another(self, config: RunConfig) -> None:
-        """Raise an InputError if the folder's run has another task, environment, learner, seed or other task files.
-
-        The path in `init_from` may differ if the state of that run is stored, because a study's folder may be moved.
-        """
-        stored = self.config()
-        stored.refuse_changed_task(self.path)
-        # An option that is missing in the stored configuration has its default.
-        stored = replace(stored, environment=as_arguments(check_environment(stored.task, stored.environment)))
-        learner: Any = stored.learner
-        if stored.source and (path := getattr(config.learner, "init_from", "")):
-            stored = replace(stored, learner=replace(learner, init_from=path))
-        for key in ("task", "environment", "learner", "seed", "members"):
-            if getattr(stored, key) != getattr(config, key):
-                raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
-
     def write_config(self, config: RunConfig) -> None:
         """Replace `config.yaml`."""
         values = asdict(config) | {"learner": config_values(config.learner)}

@@ -2,8 +2,8 @@
 
 import pytest
 
-from guiderail.diagrams.tasks import contact_probe
 from guiderail.models.common.errors import InputError
+from guiderail_studies import contact_probe
 from guiderail_studies import converge as converge_module
 from guiderail_studies.converge import coarsest_step, conditions, converge, parse_steps
 

@@ -6,13 +6,12 @@ import re
 import numpy as np
 import pytest
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects import bnc_connector, grid_clamp
 from guiderail.models.objects.bnc_connector import BORE_SIDES, FOLDER, FRICTION, LIP_RISE, LIP_WIDTH, BncDimensions
 from guiderail.models.objects.grid_clamp import FOLDER as GRID_CLAMP_FOLDER
 from guiderail.models.objects.grid_clamp import NUM_SIDES, GridClampDimensions
-from guiderail.models.objects.sdf import TriangleMesh, equal_area_radius
+from guiderail.models.objects.sdf import equal_area_radius
 
 
 def read_vertices(path):
@@ -73,21 +72,3 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
     assert clearance + dimensions.hole_chamfer + dimensions.peg_chamfer == pytest.approx(0.6 * MM)
     assert "<drake:mu_static>0.3<" in (folder / "grid_table.sdf").read_text()
     assert FRICTION != 0.3
-
-
-@pytest.mark.parametrize("face", ["f -1 -2 -3", "f 0 1 2", "f 1/1 2/2 4/4"])
-def test_mesh_is_refused_when_a_face_has_an_unknown_vertex(face, tmp_path):
-    path = tmp_path / "part.obj"
-    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n{face}\n")
-    with pytest.raises(InputError, match=r"part\.obj has a vertex outside 1 … 3"):
-        TriangleMesh.from_obj(path)
-
-
-@pytest.mark.parametrize(
-    "lines", ["f 1 2 3 4", "f 1 2 3\nf 1 2 3 4", "f a b c", f"f 1 2 {2**70}", "", "v 0 0\nf 1 2 3"]
-)
-def test_mesh_is_refused_unless_all_faces_are_triangles(lines, tmp_path):
-    path = tmp_path / "part.obj"
-    path.write_text(f"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{lines}\n")
-    with pytest.raises(InputError, match=r"part\.obj must hold vertices of three numbers, and triangles only"):
-        TriangleMesh.from_obj(path)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.primitives import Matern52, SquaredExponential
-from guiderail.models.primitives.features import window_features
+from guiderail.models.primitives.window import window_features
 
 KERNELS = [SquaredExponential(0.5), SquaredExponential(0.1), Matern52(0.4)]
 

@@ -14,8 +14,7 @@ from guiderail.models.primitives import (
     UnsolvableError,
 )
 from guiderail.models.primitives import window as window_module
-from guiderail.models.primitives.features import window_features
-from guiderail.models.primitives.window import StepFactor, Window
+from guiderail.models.primitives.window import StepFactor, Window, window_features
 from oracles.problems import random_problem
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -220,7 +219,9 @@ def test_cache_counts_bytes_and_drops_the_oldest(monkeypatch):
     assert size >= sum(array.nbytes for array in arrays)
     unlimited.predict(0)
     assert unlimited.cached_bytes == size
-    assert unlimited.factor_all() == 30 * size
+    for step in range(30):
+        unlimited.linear_response(step)
+    assert unlimited.cached_bytes == 30 * size
     for limit, kept in ((3 * size, [7, 8, 9]), (1, [9])):
         monkeypatch.setattr("guiderail.models.primitives.lc_ns_kmp._CACHE_BYTES", limit)
         p = primitive(None)

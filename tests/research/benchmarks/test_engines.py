@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.contact_probe import probe_contact
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail_studies.contact_probe import probe_contact
 from research.benchmarks import engines
 from research.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever
 

@@ -5,6 +5,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail_studies.job import refuse_another
 
 
 def test_config_is_read_as_written(bead_config, tmp_path):
@@ -34,9 +35,9 @@ def test_missing_option_has_its_default(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     incomplete = {key: value for key, value in bead_config.environment.items() if key != "observation"}
     folder.create(replace(bead_config, environment=incomplete))
-    folder.refuse_another(bead_config)
+    refuse_another(folder, bead_config)
     with pytest.raises(InputError, match="another environment"):
-        folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"action_repeat": 2}))
+        refuse_another(folder, replace(bead_config, environment=bead_config.environment | {"action_repeat": 2}))
 
 
 @pytest.mark.parametrize(

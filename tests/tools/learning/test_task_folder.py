@@ -23,7 +23,7 @@ from guiderail.tools.learning.train import train
 from guiderail_lerobot.env_server import open_environment
 from guiderail_studies.certify import certify_skill
 from guiderail_studies.declaration import Study
-from guiderail_studies.job import Job, digest
+from guiderail_studies.job import Job, digest, refuse_another
 
 PART = {"visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
 TASK = {
@@ -81,15 +81,15 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, run):
     (folder / name).write_text(CHANGES[name])
     for resume in (
         lambda: train(out=run.path, resume=True),
-        lambda: run.refuse_another(configure("parts/pin", {}, episodes=2)),
+        lambda: refuse_another(run, configure("parts/pin", {}, episodes=2)),
     ):
         with pytest.raises(InputError, match="the files of parts/pin are not those"):
             resume()
     (folder / name).write_text(before)
-    run.refuse_another(config)
+    refuse_another(run, config)
     run.write_config(replace(config, task_content=""))  # without the digest of the files
     (folder / name).write_text(CHANGES[name])
-    run.refuse_another(config)
+    refuse_another(run, config)
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,18 @@
 """`guiderail dataset` and `guiderail template`."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
+from guiderail.tools.cli.app import argument, command, import_option, option, print_progress, print_result
 
 dataset = cli.command_group("dataset", "Import, export and validate demonstrations, and fit bounds to them.")
 template = cli.command_group("template", "Validate shared control templates.")
 
 POSE = "x,y,z,rx,ry,rz"
+Demonstrations = Annotated[Path, argument("Demonstrations: .npz, .csv or a folder of them.", "FILE")]
+cli.CHOICES["templates"] = lambda: import_module("guiderail.models.templates.schema").shipped_templates()
 
 
 @command("dataset import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import", dataset)
@@ -47,7 +50,7 @@ def import_(
 
 @command("dataset export demonstrations.npz --to lerobot --out dataset", None, dataset)
 def export(
-    file: cli.Demonstrations,
+    file: Demonstrations,
     out: Annotated[Path, option("Folder to write; it must not exist.")],
     to: Annotated[str, option("Format: lerobot or mcap.")],
     rate: Annotated[float | None, option("Resample to this rate [1/s].")] = None,
@@ -88,7 +91,7 @@ def record(
 
 @command("dataset validate demonstrations.csv --draw demonstrations.png", None, dataset)
 def validate(
-    file: cli.Demonstrations,
+    file: Demonstrations,
     draw: Annotated[Path | None, option("Picture of the demonstrations to write: {pictures}.")] = None,
     fit: Annotated[
         bool,
@@ -105,7 +108,7 @@ def validate(
 
 @command("dataset fit-bounds demonstrations.npz --phases 4 --draw bounds.png --task ./peg", "fit-bounds", dataset)
 def fit_bounds(
-    file: cli.Demonstrations,
+    file: Demonstrations,
     phases: Annotated[int, option("Number of phases of the motion, each with its own bounds.")] = 1,
     margin: Annotated[float, option("Margin beyond the demonstrations, as a fraction of their range.")] = 0.1,
     min_margin: Annotated[float, option("Smallest margin, in the outputs' unit.")] = 0.0,
@@ -135,7 +138,7 @@ def fit_bounds(
 def validate_template(
     file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
     draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
-    imports: cli.TemplateImports = None,
+    imports: Annotated[list[str] | None, import_option("parts of templates")] = None,
     as_json: cli.Json = False,
 ) -> None:
     """Validate and summarize a shared control template before it is used."""

@@ -11,7 +11,7 @@ import typer
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
+from guiderail.tools.cli.app import argument, import_option, option, print_message, print_progress, print_result
 
 if TYPE_CHECKING:
     from guiderail_hardware.robot.connection import RobotConnection
@@ -79,7 +79,7 @@ def deploy(
     out: Annotated[
         Path | None, option("Folder of the recording.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]")
     ] = None,
-    imports: cli.HardwareImports = None,
+    imports: Annotated[list[str] | None, import_option("a robot or a driver")] = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:

@@ -21,9 +21,8 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.parsing import follow_directives
 from guiderail.systems.wrench_sensors import WrenchSensor
-from guiderail_hardware.robot.scenario import read_typed
+from guiderail_hardware.robot.scenario import follow_directives, read_typed
 
 
 @dataclass

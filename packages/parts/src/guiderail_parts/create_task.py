@@ -18,7 +18,6 @@ from guiderail.diagrams.tasks.options import COLLISION_FORCE, FORCE_LIMITS
 from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail_parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
 from guiderail_parts.geometry.assembly_check import (
@@ -38,6 +37,7 @@ from guiderail_parts.geometry.assembly_check import (
 from guiderail_parts.geometry.assembly_check import shrink as shrink_part
 from guiderail_parts.geometry.demonstrator import NUM_DEMONSTRATIONS, TOUCH
 from guiderail_parts.geometry.mesh_file import UNITS, Part, find_unit, find_units, load_part, obj_text
+from guiderail_parts.geometry.obj_file import read_obj
 from guiderail_parts.geometry.preparation import MIN_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
 
 if TYPE_CHECKING:
@@ -440,7 +440,7 @@ def _write_task(
     file = file.model_copy(update={"measured": measured, "demonstrations": fitted})
     write_task_file(folder, file)
     if hard_episodes:
-        mesh = TriangleMesh.from_obj(folder / file.plug.visual)
+        mesh = read_obj(folder / file.plug.visual)
         radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
         file = calibrate(folder, file, radius, hard_episodes, log)
         if "hard" in file.measured:

@@ -46,12 +46,12 @@ from guiderail.models.common.files import write_atomically
 from guiderail.models.common.parsing import add_models
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
-from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.movement_primitive import HistoryBuffer
 from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
+from guiderail_parts.geometry.obj_file import read_obj
 from guiderail_parts.task_file import (
     AUTOMATE,
     FILE_NAME,
@@ -122,9 +122,7 @@ class PartWorkcell(MovableWorkcell):
                 f"the {body} in {self.folder} has no convex pieces, which MuJoCo needs: choose station='gantry'"
             )
         return [
-            Surface(
-                f"{body}_{number}", "parts", Hull(TriangleMesh.from_obj(self.folder / file).vertices), self.friction
-            )
+            Surface(f"{body}_{number}", "parts", Hull(read_obj(self.folder / file).vertices), self.friction)
             for number, file in enumerate(files)
         ]
 

@@ -22,13 +22,13 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import MissingSiblingError, load_plugin, require_sibling
 from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.control.wrench import center_of_pressure
-from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
 from guiderail_parts.geometry.demonstrator import demonstrator_motions, socket_offsets, socket_turns
 from guiderail_parts.geometry.drake_check import piece_text
+from guiderail_parts.geometry.obj_file import read_obj
 from guiderail_parts.geometry.preparation import CUT_SECONDS, ContactSurface, cut_bodies
 from guiderail_parts.geometry.solids import SurfaceLocator
 from guiderail_parts.isolation import IsolatedError, run_isolated
@@ -139,7 +139,7 @@ def insert(
     compliant = {}
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         if part.pieces[0].modulus is not None:
-            mesh = TriangleMesh.from_obj(folder / part.visual)
+            mesh = read_obj(folder / part.visual)
             compliant[name] = SurfaceLocator(mesh.vertices, mesh.triangles)
     depths = Depths(station, compliant, set(snapping), times[-1] - _AT_REST)
     driven.start(poses[0])
@@ -249,7 +249,7 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
 
 
 def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
-    mesh = TriangleMesh.from_obj(file)
+    mesh = read_obj(file)
     corners = _SCALE * mesh.vertices[mesh.triangles].reshape(-1, 3)
     triangles = [SurfaceTriangle(3 * i, 3 * i + 1, 3 * i + 2) for i in range(len(corners) // 3)]
     meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), color)

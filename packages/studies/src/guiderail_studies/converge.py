@@ -193,7 +193,7 @@ def _statistics(rows: pd.DataFrame) -> dict[str, Any]:
 def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     """Return drag, lever arm and capture of a task with a rim, and the CPU time per simulated time; None without it."""
     from guiderail.diagrams.envs.config import EnvConfig
-    from guiderail.diagrams.tasks.contact_probe import probe_contact
+    from guiderail_studies.contact_probe import probe_contact
 
     made = EnvConfig.resolve(task, dict(condition.environment)).declared
     names = ("drag_20", "drag_40", "lever_mm", "capture_mm", "cost")

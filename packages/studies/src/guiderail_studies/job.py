@@ -25,12 +25,13 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.envs.options import flat_options
+from guiderail.diagrams.envs.options import flat_options, validate_options
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import (
     changed_environment,
-    check_reset,
+    check_environment,
     flat_environment,
     make_environment,
     task_content,
@@ -163,7 +164,7 @@ def check_job(job: Job) -> None:
         for end in (0, 1) if eval_set.sampled else (0,):
             sampled = {name: ends[end] for name, ends in eval_set.sampled.items()}
             configure(job.study.task, environment | sampled, episodes=1)
-        check_reset(job.study.task, eval_set.options)
+        _check_reset(job.study.task, eval_set.options)
     contents: dict[Path, str] = {}
     for episodes, eval_set in itertools.product(job.after_episodes, job.study.eval_sets):
         file, content = _evaluated_file(job, episodes, eval_set)
@@ -179,12 +180,35 @@ def check_job(job: Job) -> None:
             )
         _refuse_other_rows(file, content, eval_set)
     if (job.folder.path / "config.yaml").exists():
-        job.folder.refuse_another(config)
+        refuse_another(job.folder, config)
         for episodes in job.after_episodes:
             if not all(_is_evaluated(job, episodes, eval_set) for eval_set in job.study.eval_sets):
                 _refuse_lost_policy(job, episodes)
     elif job.learns:
         job.folder.refuse_existing()
+
+
+def refuse_another(folder: RunFolder, config: RunConfig) -> None:
+    """Raise an InputError if the run of a folder has another task, environment, learner, seed or other task files.
+
+    The path in `init_from` may differ if the state of that run is stored, because a study's folder may be moved.
+    """
+    stored = folder.config()
+    stored.refuse_changed_task(folder.path)
+    # An option that is missing in the stored configuration has its default.
+    stored = replace(stored, environment=as_arguments(check_environment(stored.task, stored.environment)))
+    learner: Any = stored.learner
+    if stored.source and (path := getattr(config.learner, "init_from", "")):
+        stored = replace(stored, learner=replace(learner, init_from=path))
+    for key in ("task", "environment", "learner", "seed", "members"):
+        if getattr(stored, key) != getattr(config, key):
+            raise InputError(f"{folder.path} holds a run with another {key}: name another folder with --out")
+
+
+def _check_reset(task: str, options: Mapping[str, Any]) -> None:
+    """Raise an InputError if a reset option of a guiderail task is invalid; other tasks are not checked."""
+    if task in TASKS.names():
+        validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
 def check_source(job: Job, *, is_source_selected: bool = False) -> str:

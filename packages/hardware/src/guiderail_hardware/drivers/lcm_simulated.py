@@ -20,7 +20,6 @@ from pydrake.systems.lcm import LcmInterfaceSystem
 from guiderail.diagrams.stations.arm import ArmControllerPlant, ArmModel, add_arm
 from guiderail.diagrams.stations.station import add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.models.common.parsing import follow_directives
 from guiderail.models.robots.catalog import IIWA14
 from guiderail_hardware.drivers.clock import Clock
 from guiderail_hardware.drivers.lcm import (
@@ -33,6 +32,7 @@ from guiderail_hardware.drivers.lcm import (
     check_handlers,
 )
 from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, MAX_SENDERS
+from guiderail_hardware.robot.scenario import follow_directives
 
 ACKNOWLEDGED = "_TAKEN"  # suffix of the channel on which a `LockstepClock` acknowledges a status
 REPEAT_INTERVAL = 0.05  # wall clock time after which an unacknowledged status is sent again [s]

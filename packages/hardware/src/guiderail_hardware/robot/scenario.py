@@ -1,6 +1,6 @@
 """Scenario file: robot, driver address and surroundings in Drake's terms, real or simulated."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,12 @@ import yaml
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcmParams
 from pydrake.manipulation import IiwaDriver
-from pydrake.multibody.parsing import ModelDirective
+from pydrake.multibody.parsing import ModelDirective, ModelDirectives, ProcessModelDirectives
+from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes
+from guiderail.models.common.parsing import allow_package_map, local_parser
 from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 
 HARDWARE, SIMULATION = "hardware", "simulation"
@@ -165,3 +167,23 @@ def load_scenario(path: Path) -> Scenario:
                     "without it"
                 )
     return scenario
+
+
+def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective], folder: Path | None = None) -> None:
+    """Add the models of Drake model directives to a plant.
+
+    The directives name files by absolute paths (file://), in the package `guiderail`, which has the models of this
+    package (package://guiderail/robots/iiwa14.urdf), or in a package (folder with a `package.xml`) in `folder`.
+
+    Raises:
+        InputError: If the directives cannot be processed.
+    """
+    try:
+        with allow_package_map():
+            parser = local_parser(plant)
+            if folder is not None:
+                parser.package_map().PopulateFromFolder(str(folder.resolve()))
+            ProcessModelDirectives(ModelDirectives(directives=list(directives)), parser)
+    except (RuntimeError, SystemExit) as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"the model directives can't be processed: {words}") from error

@@ -5,10 +5,11 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.station import PLANT_PERIOD
-from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, ContactProbe, drag, probe_contact
+from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects import bnc_connector
+from guiderail_studies.contact_probe import ContactProbe, probe_contact
 
 CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
