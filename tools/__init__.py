@@ -1,1 +1,1 @@
-"""Applications: the `guiderail` command, training, evaluation, studies, datasets and operation of robots."""
+"""Applications: the `guiderail` command, training, evaluation and visualization."""

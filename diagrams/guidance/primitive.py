@@ -1,4 +1,8 @@
-"""Guidance by a movement primitive: the demonstrations alone (KMP), KGRL, sKGRL and residual RL."""
+"""Guidance by a movement primitive: the demonstrations alone (KMP), KGRL, sKGRL and residual RL.
+
+`make_law` is also what `guiderail export` writes. In a diagram its law has the parameters, and the systems of
+`systems/movement_primitive.py` compute.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +68,8 @@ def make_law(
             (the demonstrations alone).
         constrained: Enforce the linear constraints at every future point.
         history: True if the motion passes through the last outputs (sKGRL).
-        make_filter: Function that returns the filter of a residual's commands; by default none.
+        make_filter: Function that returns the filter of a residual's commands; by default none. It needs
+                ``constrained=False``, because the primitive's own constraints replace it.
 
     Raises:
         InputError: If limits of the motion are given, for guidance that does not enforce them, or the motion of a
@@ -76,6 +81,8 @@ def make_law(
         raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
     command_filter: CommandLaw | None = None
     if make_filter is not None:
+        if constrained or action != "residual":
+            raise ValueError("a filter is for residual commands without the primitive's constraints")
         assert config.keep_out is not None
         command_filter = make_filter(config, config.keep_out)
     if action == "none" or constrained:

@@ -1,4 +1,9 @@
-"""Prior knowledge about a task, from which guidance is built."""
+"""Prior knowledge about a task, from which guidance is built.
+
+`Prior` is what a task declares, `PriorKnowledge` what guidance is built from: `diagrams/envs/assemble.py` fills the
+fields of `PrimitiveConfig` from those of `PrimitiveOptions` with equal names. `PriorKnowledge.primitive` is a
+configuration, whose method `primitive` makes the movement primitive.
+"""
 
 from __future__ import annotations
 

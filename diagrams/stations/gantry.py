@@ -1,4 +1,7 @@
-"""Gantry station: tool center on six impedance-controlled joints, faster to simulate than an arm."""
+"""Gantry station: tool center on six impedance-controlled joints, faster to simulate than an arm.
+
+The station `mujoco` of packages/mujoco has the same joints, carriage and damping and imports them from here.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Pouring station: an arm under Cartesian position control with a thermos and balls, and a mug on a table."""
+"""Pouring station: an arm under Cartesian position control with a thermos and balls, and a mug on a table.
+
+`PouringConfig` is the workcell that the task Pouring returns; only that task calls `make_mug` and `set_mug`.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -1,1 +1,1 @@
-"""Tasks, one folder each, and their registry."""
+"""Tasks, one file each, and their registry."""

@@ -71,8 +71,9 @@ class BncUncertainty(HiddenOffsets):
     - "per_episode": the jack is within 1.5 mm of its nominal position, sampled each episode.
     - "none": the jack is within 0.3 mm of its nominal position, sampled each episode.
 
-    With `jack_turn`, the jack is also rotated about its axis; the jack's offset is then [x, y, angle]. The reset option
-    `offset` sets the jack's position; the jack is then not rotated, and the plug not offset.
+    With `jack_turn`, which only the tasks of packages/parts set, the jack is also rotated about its axis; the jack's
+    offset is then [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and
+    the plug not offset.
     """
 
     def __init__(

@@ -1,4 +1,8 @@
-"""Fields of options that tasks share, hidden offsets and references fitted to files; nothing here imports Drake."""
+"""Fields of options that tasks share, hidden offsets and references fitted to files; nothing here imports Drake.
+
+The fields and limits also define `task.yaml` of packages/parts, and exported C++ skills have `CONTACT_MEMORY` and
+`MIN_CONTACT_FORCE`.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,10 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def digest(arrays: Mapping[str, np.ndarray], text: str) -> str:
-    """Compute a digest of a text and of arrays with their names, types and shapes."""
+    """Compute a digest of a text and of arrays with their names, types and shapes.
+
+    It is stored in policies and checkpoints, which another digest would make unreadable.
+    """
     hasher = hashlib.blake2b(text.encode())
     for key in sorted(arrays):
         hasher.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())

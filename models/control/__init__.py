@@ -1,1 +1,1 @@
-"""Control laws without Drake systems: impedance, wrenches, limits and filters of commands, and joint status."""
+"""Control laws without Drake systems: impedance, wrenches, limits and filters of commands."""

@@ -1,6 +1,7 @@
 """Cartesian impedance law: a spring to the desired pose, and a damper designed from the spring and the inertia.
 
 Vectors of six are [translational, rotational], and all quantities are expressed in one frame.
+`systems/support/scalar_conversion.py` has the same law for AutoDiffXd.
 """
 
 from dataclasses import dataclass

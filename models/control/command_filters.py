@@ -3,6 +3,8 @@
 The barrier and ATACOM bound the change of a command from one control step to the next by constraints with rows of unit
 norm, h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. If a desired
 command is not finite, the last command is repeated.
+
+These filters are for residual RL. `MotionConstraintFilter` of `motion_constraints.py` is a `CommandLaw`, too.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Damped inverse kinematics: joint velocities for a tool velocity, bounded near singular postures."""
+"""Damped inverse kinematics: joint velocities for a tool velocity, bounded near singular postures.
+
+`LEVER` also scales the violations that `MotionConstraints` reports, and the test of the impedance for regular postures.
+"""
 
 import numpy as np
 

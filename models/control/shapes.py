@@ -7,6 +7,8 @@ subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, h
   and therefore the straight line from p to every other point of the half-space.
 - The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the true distance of a command is at least
   its linearization. For a sphere whose center is at the distance r from p, the error is at most ‖y − p‖² / (2 r).
+
+`MotionConstraintFilter` and the constraints `Outside` of templates use these half-spaces and `CLEARANCE`.
 """
 
 from __future__ import annotations

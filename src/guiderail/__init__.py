@@ -1,8 +1,8 @@
 """Constrained reinforcement learning for contact-rich manipulation: RL-SCT, KGRL and sKGRL as Drake systems diagrams.
 
 The four folders of the repository are the four parts of this package: `models` (numerics without Drake systems),
-`systems` (one LeafSystem per file), `diagrams` (wiring) and `tools` (the command and the Python API). Importing the
-package registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
+`systems` (the LeafSystems of one concept in a file), `diagrams` (wiring) and `tools` (the command and the Python API).
+Importing the package registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
 Movement primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and `learn`
 install.
 """

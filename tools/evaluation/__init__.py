@@ -1,1 +1,1 @@
-"""Evaluation of policies: rollouts, metrics, baselines and robustness."""
+"""Evaluation of policies: rollouts, metrics and baselines."""

@@ -15,7 +15,7 @@ from guiderail.tools.spaces import from_tensors
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
 
-HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode  # seed of the first held-out episode
+HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Pictures, pages and videos of episodes, runs and studies."""
+"""Pictures, pages and videos of episodes and runs."""

@@ -1,4 +1,8 @@
-"""Self-contained HTML page of episodes before and after learning: animation and plots on one time axis."""
+"""Self-contained HTML page of episodes before and after learning: animation and plots on one time axis.
+
+`guiderail visualize` and the end of a training write it. The script in `replay.html` reads the data by the keys that
+`MotionRecorder.data` and `write_page` give them.
+"""
 
 from __future__ import annotations
 

@@ -7,10 +7,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.command_filters import KeepOut
+from guiderail.models.control.command_filters import KeepOut, KeepOutFilter
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import StateProgress
@@ -246,3 +247,10 @@ def test_limits_are_expanded_to_all_outputs():
     for limits in [], [1.0, 2.0, 3.0]:
         with pytest.raises(InputError, match=f"max_speed is 1, 2 or 6 numbers for 6 outputs, not {len(limits)}"):
             limits_per_output("max_speed", limits, 6)
+
+
+def test_filter_of_a_residual_is_refused_where_the_constraints_would_replace_it(skill):
+    prior = PriorKnowledge(skill.control_period, primitive=skill)
+    for options in ({"action": "residual", "constrained": True}, {"action": "null_space", "constrained": False}):
+        with pytest.raises(ValueError, match="a filter is for residual commands"):
+            make_law(prior, **options, history=False, make_filter=lambda config, walls: KeepOutFilter(walls))
