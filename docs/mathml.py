@@ -17,7 +17,7 @@ def mathml(tex: str, block: bool) -> str:
     except MathError as error:
         raise ValueError(f"the equation {tex!r} cannot be converted: {error}") from error
     ElementTree.register_namespace("", NAMESPACE)
-    root = ElementTree.fromstring(text)
+    root = ElementTree.fromstring(text.replace("&ApplyFunction;", "\N{FUNCTION APPLICATION}"))  # not an entity of XML
     for over in root.iter(f"{{{NAMESPACE}}}munderover"):
         base, index, accent = over
         if (accent.text or "") in ACCENTS:
