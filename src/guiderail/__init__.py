@@ -2,9 +2,9 @@
 
 The four folders of the repository are the four parts of this package: `models` (numerics without Drake systems),
 `systems` (the LeafSystems of one concept in a file), `diagrams` (wiring) and `tools` (the command and the Python API).
-Importing the package registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
-Movement primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and `learn`
-install.
+Importing the package registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported
+on first use. Movement primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and
+`learn` install.
 """
 
 from importlib.metadata import version

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
@@ -25,14 +26,13 @@ from guiderail.models.primitives import LinearConstraints, Matern52, ReferenceTr
 from guiderail.models.templates import load_template, parse_template
 from guiderail.systems.command_checks import CommandWatchdog, ConstraintViolation
 from guiderail.systems.wrench_limits import PhaseWrenchLimit
-from guiderail.tools.export import GUIDED, load_skill
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
 from guiderail_cpp.project import EXPORTED, governor_arrays, policy_arrays, skill_arrays
 from guiderail_cpp.recording import double_action, record_skill
+from guiderail_cpp.skill import GUIDED, load_skill
 from guiderail_cpp.templates import template_arrays
-from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
 
 Files = tuple[bytes, bytes]
 """Content of the files of the data and of the recording."""
@@ -369,6 +369,8 @@ def phase_limit(steps: int) -> Files:
 
 
 def rate_limiter(steps: int) -> Files:
+    from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
+
     rng, period = np.random.default_rng(7), 0.01
     desired = np.zeros(6)
 
@@ -436,9 +438,10 @@ LAWS: dict[str, Callable[[int], Files]] = {
     "governor": governor,
     "force bound": force_bound,
     "limit of a state": phase_limit,
-    "rate limiter": rate_limiter,
     "watchdog": watchdog,
 }
+if find_spec("guiderail_hardware") is not None:  # which has the system that limits the rate in Python
+    LAWS["rate limiter"] = rate_limiter
 
 TOLERANCES = {"kgrl, equal bounds": 1e-11}
 """Largest differences of laws that are solved less accurately in Python, where this equation is violated by 2e-12."""
