@@ -228,6 +228,7 @@ def _check_station(task: type[Task], name: Any) -> None:
     """Raise an InputError unless the task supports a station; only this station is imported if it does."""
     is_known = isinstance(name, str) and name in STATIONS.names() and name not in task.unsupported_stations
     if not is_known or STATIONS.get(name).workcell_kind != station_kind_of(task).workcell_kind:
+        STATIONS.refuse_missing(str(name))
         check_choice("station", name, stations_of(task), task.name)
 
 

@@ -222,9 +222,7 @@ class Registry(Generic[Entry]):
                     self._load(name, point)
             self._loaded.add(name)
         if name not in self._entries:
-            for sibling, provided in SIBLINGS.items():
-                if f"{self._plugin}:{name}" in provided:
-                    raise MissingSiblingError(f"the {self.noun} {name!r}", sibling)
+            self.refuse_missing(name)
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
@@ -241,6 +239,12 @@ class Registry(Generic[Entry]):
                 raise InputError(f"there is another {self.noun} {name!r}, from {place}: rename one, or uninstall it")
         except InputError as error:
             raise InputError(f"the {self.noun} {name!r} of {_package_of(point)} cannot be used: {error}") from error
+
+    def refuse_missing(self, name: str) -> None:
+        """Raise a MissingSiblingError if there is no entry of this name, but a sibling has one."""
+        for sibling, provided in SIBLINGS.items():
+            if f"{self._plugin}:{name}" in provided and name not in self.names():
+                raise MissingSiblingError(f"the {self.noun} {name!r}", sibling)
 
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""
