@@ -1,6 +1,5 @@
 from .constraints import LinearConstraints as LinearConstraints
 from .demonstrations import Demonstrations as Demonstrations
-from .demonstrations import align_demonstrations as align_demonstrations
 from .demonstrations import pose_demonstrations as pose_demonstrations
 from .kernels import Kernel as Kernel
 from .kernels import Matern52 as Matern52

@@ -46,7 +46,6 @@ from .models.primitives import LinearConstraints as LinearConstraints
 from .models.primitives import Matern52 as Matern52
 from .models.primitives import ReferenceTrajectory as ReferenceTrajectory
 from .models.primitives import SquaredExponential as SquaredExponential
-from .models.primitives import align_demonstrations as align_demonstrations
 from .models.primitives import register_kernel as register_kernel
 from .models.robots.robot import Robot as Robot
 from .models.robots.robot import register_robot as register_robot

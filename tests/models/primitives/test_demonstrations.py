@@ -3,7 +3,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.demonstrations import align_demonstrations, compute_bounds, phases_of_steps
+from guiderail.models.primitives.demonstrations import compute_bounds, phases_of_steps
+from guiderail_data.alignment import align_demonstrations
 
 
 def wavy(lengths=(50, 80), outputs=2):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from guiderail import Demonstrations, Segment, align_demonstrations, cut_demonstrations, find_events
+from guiderail import Demonstrations, Segment, cut_demonstrations, find_events
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.demonstrations import _warping_path
+from guiderail_data.alignment import _warping_path, align_demonstrations
 
 
 def recordings():
