@@ -1,9 +1,10 @@
 """Export of skills: the ONNX file computes the policy's actions, and a loop without an environment its commands."""
 
-import re
+import importlib.util
+import subprocess
+import sys
 from dataclasses import replace
-from itertools import count, pairwise
-from pathlib import Path
+from itertools import pairwise
 
 import numpy as np
 import onnxruntime
@@ -19,6 +20,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.onnx import export_onnx, policy_to_onnx
+from guiderail_cpp.recording import COMPUTED
 
 
 @settings(deadline=None, max_examples=40)
@@ -46,44 +48,58 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
         np.testing.assert_allclose(action[0], policy(observation), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["connector", "passage"])
-def test_loop_of_the_docs_acts_as_the_environment(name, tmp_path, monkeypatch):
-    """The loop without an environment in docs/use.md commands what the environment of the run commands."""
-    page = (Path(__file__).parents[3] / "docs/use.md").read_text("utf-8").partition("\n## A skill without")[2]
-    (code,) = re.findall(r"```python\n(.*?)```", page.partition("\n## ")[0], re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    export_onnx(f"pretrained:{name}", Path("connector"))
-    loop: dict = {}
-    exec(compile(code, "use.md", "exec"), loop)
-    skill, config = loop["skill"], RunFolder(find_run(f"pretrained:{name}")).config()
-    env, policy = make_environment(config.task, config.environment), Policy.load(find_run(f"pretrained:{name}"))
+@pytest.fixture(scope="module", params=["connector", "passage"])
+def exported(request, tmp_path_factory):
+    """Return the name of a pretrained policy, the folder of its export, and the exported loop as a module."""
+    folder = tmp_path_factory.mktemp("export") / request.param
+    export_onnx(f"pretrained:{request.param}", folder)
+    spec = importlib.util.spec_from_file_location("exported_loop", folder / "loop.py")
+    loop = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loop)
+    return request.param, folder, loop
+
+
+def test_exported_loop_replays_the_recording(exported):
+    _, folder, _ = exported
+    result = subprocess.run([sys.executable, folder / "loop.py"], capture_output=True, text=True, check=True)
+    assert float(result.stdout.partition(": ")[2].split()[0]) < 1e-6
+
+
+def test_exported_loop_commands_what_the_environment_commands(exported):
+    name, folder, loop = exported
+    config = RunFolder(find_run(f"pretrained:{name}")).config()
+    env, policy, skill = (
+        make_environment(config.task, config.environment),
+        Policy.load(find_run(f"pretrained:{name}")),
+        loop.Skill(),
+    )
     observation, _ = env.reset(seed=1_000_000)
-    assert len(skill["observation"]) == len(observation)
     simulator = env.unwrapped.simulator
     station = simulator.get_system().GetSubsystemByName("station")
-    pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
-    commands: list[np.ndarray] = []
-    reads = count()
-
-    def read_signals():
-        nonlocal observation
-        if next(reads) == 0:
-            return {"pose": pose}
-        if commands:
-            observation, _, terminated, truncated, _ = env.step(policy(observation))
-            assert (terminated, truncated) == (False, False)
-            recent = env.unwrapped.trace.commanded[-skill["action_repeat"] :]
-            np.testing.assert_allclose(recent, commands[-skill["action_repeat"] :], atol=1e-6)
-        if len(commands) == 3 * skill["action_repeat"]:
-            raise KeyboardInterrupt
-        signals: dict = {}
-        for entry, value in zip(skill["observation"], observation, strict=True):
-            signals.setdefault(entry["signal"], {})[entry["index"]] = value * entry["scale"] + entry["center"]
-        return signals
-
-    with pytest.raises(KeyboardInterrupt):
-        loop["run"](read_signals, commands.append)
+    context = station.GetMyContextFromRoot(simulator.get_context())
+    pose = station.GetOutputPort("pose").Eval(context)
+    skill.start(pose)
+    wrench = np.zeros(6 if name == "connector" else 0)
+    for _ in range(3):
+        signals = measured_signals(skill, observation)
+        observation, _, terminated, truncated, _ = env.step(policy(observation))
+        assert (terminated, truncated) == (False, False)
+        trace, last = env.unwrapped.trace, -config.action_repeat
+        wrenches = trace.signals["wrench"] if len(wrench) else np.zeros((len(trace), 0))
+        after = list(zip(trace.measured[last:], wrenches[last:], strict=True))
+        commands = [skill.step(*each, **signals) for each in [(pose, wrench), *after[:-1]]]
+        np.testing.assert_allclose(commands, trace.commanded[last:], atol=1e-6)
+        pose, wrench = after[-1]
     env.close()
+
+
+def measured_signals(skill, observation):
+    """Return the signals of an observation that do not follow from pose, wrench and commands, such as obstacles."""
+    signals = {}
+    for entry, value in zip(skill.entries, observation, strict=True):
+        if entry["signal"] not in (*COMPUTED, "wrench"):
+            signals.setdefault(entry["signal"], {})[entry["index"]] = value * entry["scale"] + entry["center"]
+    return signals
 
 
 def test_export_is_refused_in_one_sentence(tmp_path, capsys):

@@ -3,27 +3,31 @@
 import io
 import math
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 
 import numpy as np
 
 from guiderail.diagrams.guidance.primitive import make_law
+from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PRIMITIVE_FILE, SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
+from guiderail_cpp.recording import COMPUTED, record_skill, signal_sizes
 from guiderail_cpp.skill import GUIDED, Exporter, TrainedSkill, to_json
 
 EXPORTED = {"kernel": DEFAULT_KERNEL, "history.source": "commanded", "history.adaptive": False}
 """Options whose other values the loop of a skill without an environment does not implement."""
-POLICY_FILE = "policy.onnx"
+POLICY_FILE, RECORDING_FILE, LOOP_FILE = "policy.onnx", "recording.npz", "loop.py"
 
 
 def _onnx_files(skill: TrainedSkill) -> dict[str, bytes]:
-    """Return the policy, the meaning of its observation and action, and the data of its guidance.
+    """Return the policy, the meaning of observation and action, the data of the guidance, and a loop that uses them.
 
     `policy.onnx` is the deterministic policy: observation (1, n) → action (1, A), both float32. `skill.json` lists the
     entries of both in their order, with names, units, centers and scales, and the settings of the guidance.
-    `primitive.npz` has the reference, constraints and gains of a movement primitive.
+    `primitive.npz` has the reference, constraints and gains of a movement primitive. `loop.py` computes the commands
+    without an environment, and compares them with the random steps of `recording.npz`.
     """
     environment, config = skill.config.environment, skill.prior.primitive
     assert config is not None
@@ -45,8 +49,23 @@ def _onnx_files(skill: TrainedSkill) -> dict[str, bytes]:
     }  # fmt: skip
     for entry, output in zip(description["action"], law.outputs, strict=True):
         entry["output"] = output
-    files = {POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue()}
-    return files | {SKILL_FILE: to_json(description)}
+    description["contact"] = {"min_force": MIN_CONTACT_FORCE, "memory_s": CONTACT_MEMORY}
+    return {
+        POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue(), SKILL_FILE: to_json(description),
+        LOOP_FILE: (files("guiderail_cpp") / "onnx_files" / LOOP_FILE).read_bytes(), RECORDING_FILE: _recorded(skill),
+    }  # fmt: skip
+
+
+def _recorded(skill: TrainedSkill) -> bytes:
+    """Return recorded random steps (.npz): measured poses, commands, and the signals that are measured, too."""
+    sizes = signal_sizes(skill.description["observation"])
+    recording = record_skill(skill, sizes)
+    ends = np.cumsum([*sizes.values()])
+    signals = dict(zip(sizes, np.split(recording["replay/signals"], ends[:-1], axis=1), strict=True))
+    columns = {name: recording[f"replay/{name}"] for name in ("reset", "pose", "command")}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **{name: signals[name] for name in signals if name not in COMPUTED}, **columns)
+    return buffer.getvalue()
 
 
 export_onnx = Exporter(GUIDED, EXPORTED, _onnx_files)

@@ -18,12 +18,11 @@ from guiderail.diagrams.stations.impedance_control import (
     WRENCH_RATE,
 )
 from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
-from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.recording import record_skill
+from guiderail_cpp.recording import record_skill, signal_sizes
 from guiderail_cpp.skill import GUIDED, Exporter, TrainedSkill, to_json
 from guiderail_cpp.templates import template_arrays
 
@@ -140,11 +139,7 @@ def policy_arrays(policy: Policy) -> Arrays:
 
 def _observation_arrays(entries: list[Mapping[str, Any]]) -> tuple[Arrays, dict[str, int]]:
     """Return the arrays of the observation's entries, and the sizes of the observed signals by name."""
-    sizes: dict[str, int] = {}
-    for entry in entries:
-        if entry["index"] < 0:
-            raise InputError(f"the entry {entry['name']} counts from the end of its signal: count from its beginning")
-        sizes[entry["signal"]] = max(sizes.get(entry["signal"], 0), entry["index"] + 1)
+    sizes = signal_sizes(entries)
     names = list(sizes)
     rows = [
         [names.index(entry["signal"]), *(float(entry[key]) for key in ("index", "center", "scale", "clip"))]

@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import ContactPointMean, center_of_pressure
 from guiderail.models.policy import Policy
@@ -23,6 +24,20 @@ Entries = Sequence[Mapping[str, Any]]
 EPISODES = 4  # number of recorded episodes
 SPREAD = 0.3  # probability that a random entry of the observation is far outside, where it is clipped
 START_SPREAD, TRACKING_SPREAD = 1e-3, 5e-4  # standard deviations of measured poses at a start and around a command
+
+
+COMPUTED = ("time", "phase", "pose", "desired_pose", "center_of_pressure", "mean_contact_point")
+"""Signals that follow from the measured pose and wrench and from the commands."""
+
+
+def signal_sizes(entries: Entries) -> dict[str, int]:
+    """Return the sizes of the observed signals by name."""
+    sizes: dict[str, int] = {}
+    for entry in entries:
+        if entry["index"] < 0:
+            raise InputError(f"the entry {entry['name']} counts from the end of its signal: count from its beginning")
+        sizes[entry["signal"]] = max(sizes.get(entry["signal"], 0), entry["index"] + 1)
+    return sizes
 
 
 def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int = EPISODES, seed: int = 0) -> Arrays:
