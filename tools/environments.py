@@ -24,6 +24,7 @@ from guiderail.diagrams.envs.options import (
 )
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
+    GIVEN,
     TASKS,
     check_task_name,
     content_digest,
@@ -231,7 +232,7 @@ class _KeptOpen(gymnasium.Wrapper[Any, Any, Any, Any]):
 def register_environment(env: gymnasium.Env) -> str:
     """Register an environment that is given as an object with Gymnasium, for this process; return its id."""
     kind = re.sub(r"\W", "", type(env.unwrapped).__name__) or "Environment"
-    name = f"given/{kind}-v{sum(known.startswith(f'given/{kind}-v') for known in gymnasium.registry)}"
+    name = f"{GIVEN}{kind}-v{sum(known.startswith(f'{GIVEN}{kind}-v') for known in gymnasium.registry)}"
 
     def entry_point(**arguments: Any) -> gymnasium.Env[Any, Any]:
         return _KeptOpen(env)

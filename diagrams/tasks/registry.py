@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     TaskClass = TypeVar("TaskClass", bound=type[Task])
 
+GIVEN = "given/"  # namespace of environments that are given as objects, which exist in one process only
 IMPORT_HINT = ", or --import the file that registers it"
 TASKS: Registry[type[Task]] = Registry("task", plugin="task", check=lambda name, task: _check(name, task))
 
@@ -59,6 +60,11 @@ def check_task_name(name: object) -> None:
     if name not in known_tasks() and name not in gymnasium.registry:
         if str(name).startswith((".", "/", "~")):
             raise InputError(f"there is no task.yaml in {name}: name a folder that guiderail create-task made")
+        if str(name).startswith(GIVEN):
+            raise InputError(
+                f"{name} was given to training as an object: evaluate the run in Python with guiderail.evaluate(run, "
+                "env), or register the environment with Gymnasium in a file and train it by its id with --import"
+            )
         raise InputError(f"there is no task {brief(name)}: {did_you_mean(name, known_tasks(), IMPORT_HINT)}")
 
 

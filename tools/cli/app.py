@@ -63,7 +63,7 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
     columns = [*result.get("baselines", ())]
     labels = {key: key if " " in key else key.replace("_", space) for key in result}
     units = {key: STATISTICS[key].unit for key in {*result} & {*STATISTICS}}
-    is_rounding = partial(_is_rounding, {key for key, unit in units.items() if unit == VIOLATION})
+    is_none = partial(_is_none, {key for key, unit in units.items() if unit == VIOLATION})
     labels |= {key: f"{labels[key]} [{unit}]" for key, unit in units.items() if unit in SYMBOLS}
     width = max(len(label) for label in labels.values())
     if columns:
@@ -76,15 +76,15 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
         ):
             continue
         values = [value, *(result[f"{name}_{key}"] for name in columns if f"{name}_{key}" in result)]
-        cells = ["none" if is_rounding(key, entry) else cell(entry) for entry in values]
+        cells = ["none" if is_none(key, entry) else cell(entry) for entry in values]
         typer.echo("  ".join([f"{labels[key]:<{width}}", *(f"{text:<{COLUMN}}" for text in cells)]).rstrip())
 
 
-def _is_rounding(violations: set[str], key: str, value: Any) -> bool:
-    """Return True if a value is a constraint violation that is rounding of the primitive's solver."""
+def _is_none(violations: set[str], key: str, value: Any) -> bool:
+    """Return True if a value is a constraint violation that is none, up to rounding of the primitive's solver."""
     from guiderail.tools.evaluation.metrics import TOLERANCE
 
-    return key in violations and isinstance(value, float) and abs(value) <= TOLERANCE
+    return key in violations and isinstance(value, float) and value <= TOLERANCE
 
 
 # Commands import their tools when they are called, because PyTorch and Drake take seconds to import.

@@ -55,6 +55,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 
+STATED = ("guidance", "difficulty", "observation", "action_repeat")  # options that a result states without a run
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
 # Function from an environment and an episode's row to further data of the episode.
@@ -403,6 +404,9 @@ def _evaluate_subject(subject: Subject, env: Any, is_given: bool, options: _Opti
     else:
         environment = subject.changed_environment(environment)
         scope = evaluation_scope(config.task, environment, resample_offsets)
+        if subject.folder is None:  # a run states its environment
+            chosen = [f"{name}={environment[name]}" for name in STATED if name in environment]
+            scope = ", ".join([scope, *chosen])
     if resample_offsets and config is not None:
         kwargs["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed

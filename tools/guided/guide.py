@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from guiderail.models.common.arrays import is_whole
@@ -32,6 +33,9 @@ from guiderail.tools.guided.segment import Frame, Segment, as_bool
 PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
 GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 
+# Distance of an episode's start from that of the demonstrations above which a warning names both: multiple of the
+# demonstrations' standard deviation, and fraction of their range; one of two different units exceeds both.
+FAR_DEVIATIONS, FAR_FRACTION = 10.0, 0.1
 # Scale of the observed command of a template [m, rad]; a template has no demonstrations that define a range.
 _COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
 
@@ -224,7 +228,7 @@ class PrimitiveGuide(Guide):
         (self.num_outputs,) = sizes
         self._period = period
         self._orientation = _orientation_of(segments, settings.orientation)
-        self.guidance, self.settings = guidance, settings
+        self.guidance, self.settings, self._has_begun = guidance, settings, False
         check_action_scale(settings.action_scale)
         self._dims = _checked_dims(settings.action_dims, self.num_outputs)
         self.num_actions = len(self._dims)
@@ -236,6 +240,21 @@ class PrimitiveGuide(Guide):
         self._recent = [np.array(pose, dtype=float)]
         self._is_ended = False
         self._begin_segment(0, env, observation)
+        if not self._has_begun:
+            self._has_begun = True
+            self._warn_of_distant_start()
+
+    def _warn_of_distant_start(self) -> None:
+        """Warn if the pose is so far from the demonstrations' start that one of them may have another unit or frame."""
+        reference = self.segments[0].reference
+        start, deviation = reference.means[0], np.sqrt(np.diag(reference.covariances[0]))
+        distance = float(np.linalg.norm(self._last_output - start))
+        if distance > max(FAR_DEVIATIONS * np.linalg.norm(deviation), FAR_FRACTION * np.ptp(reference.means, 0).max()):
+            gymnasium.logger.warn(
+                f"the first episode begins at {_numbers(self._last_output)}, and the demonstrations at "
+                f"{_numbers(start)} with standard deviations {_numbers(deviation)}: check units and frames of the "
+                "measured pose and of the demonstrations"
+            )
 
     def _begin_segment(self, index: int, env: Any, observation: Any) -> None:
         self._index, self._step = index, 0
@@ -442,3 +461,8 @@ class LawGuide(Guide):
 def predict_request(request: Request | None) -> np.ndarray | None:
     """Return the output (O,) of a requested prediction; None if there is no request or it has no solution."""
     return None if request is None else predict(*request)
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Return numbers with three digits for a message."""
+    return np.array2string(values, precision=3, separator=", ", suppress_small=False)

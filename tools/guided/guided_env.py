@@ -33,6 +33,7 @@ from guiderail.tools.guided.segment import Constraints, Segment
 from guiderail.tools.spaces import check_reset_result, check_step_result, check_values, naming_wrong_counts
 
 OBSERVED = ("phase", "command")
+FAR_OUTSIDE = 10.0  # distance of an action from the action space that is refused, in widths of the space
 SUCCESSES = ("is_success", "success")  # entries of `info` that report success
 
 
@@ -291,6 +292,14 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             is_action = False
         if not is_action:
             raise InputError(f"to_action must return finite numbers of shape {space.shape}, not {brief(action)}")
+        # An environment may clip actions a little outside of its space, but then it does not follow the command.
+        with np.errstate(over="ignore", invalid="ignore"):
+            beyond = np.maximum(space.low - action, action - space.high) / (space.high - space.low)
+        if (beyond > FAR_OUTSIDE).any():
+            raise InputError(
+                f"to_action returned {brief(action)}, and the environment's actions are from {brief(space.low)} to "
+                f"{brief(space.high)}: check the units of to_action, the demonstrations and the constraints"
+            )
 
     def _measured(self) -> np.ndarray:
         measured = as_numbers(self._pose(self.env, self._observation), "the measured pose")

@@ -66,7 +66,7 @@ def test_exported_loop_replays_the_recording(exported):
 
 
 def test_exported_loop_commands_what_the_environment_commands(exported):
-    name, folder, loop = exported
+    name, _, loop = exported
     config = RunFolder(find_run(f"pretrained:{name}")).config()
     env, policy, skill = (
         make_environment(config.task, config.environment),

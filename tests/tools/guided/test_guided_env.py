@@ -1,5 +1,6 @@
 """Guidance around any Gymnasium environment: constraints, frames, segments, observations and refused arguments."""
 
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -604,3 +605,32 @@ def test_law_with_memory_guides_any_environment():
     assert env.action_space.shape == (3,)
     with pytest.raises(InputError, match="a guide does not use demonstrations"):
         make_guided(Integrator(3), constraints=None, frame=None)
+
+
+def test_pose_in_another_unit_than_the_demonstrations_is_warned_of_once():
+    env = make_guided(constraints=None, frame=None, pose=lambda env, observation: 1e3 * pose(env, observation))
+    with pytest.warns(UserWarning, match="check units and frames of the measured pose"):
+        env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset(seed=1)
+
+
+def test_start_at_the_demonstrations_causes_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(20):
+            make_guided().reset(seed=seed)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_action_far_outside_of_the_space_is_refused_before_a_step(sign):
+    def to_action_in_millimeters(*arguments):
+        return np.full_like(to_action(*arguments), sign * 1e3)
+
+    env = make_guided(to_action=to_action_in_millimeters)
+    env.reset(seed=0)
+    before = env.unwrapped.p.copy()
+    with pytest.raises(InputError, match="check the units of to_action, the demonstrations and the constraints"):
+        env.step(np.zeros(3))
+    np.testing.assert_array_equal(env.unwrapped.p, before)

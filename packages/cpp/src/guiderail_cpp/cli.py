@@ -25,9 +25,9 @@ def export(
 
     With onnx, the folder contains the policy (policy.onnx), the names, units, centers and scales of observation and
     action in their order and the settings of the guidance (skill.json), and the data of its movement primitive
-    (primitive.npz). Its loop.py runs the skill without an environment: python FOLDER/loop.py replays recorded steps, and
-    needs onnxruntime (the extra guiderail[onnx]). With cpp, it contains a C++ library that computes the commands, its
-    data, and a test.
+    (primitive.npz). Its loop.py runs the skill without an environment: python FOLDER/loop.py replays recorded steps,
+    and needs onnxruntime (the extra guiderail[onnx]). With cpp, it contains a C++ library that computes the commands,
+    its data, and a test.
     """
     if target not in EXPORTERS:
         raise InputError(f"there is no target {target!r}: {did_you_mean(target, EXPORTERS)}")

@@ -4,6 +4,7 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
@@ -62,9 +63,10 @@ def _recorded(skill: TrainedSkill) -> bytes:
     recording = record_skill(skill, sizes)
     ends = np.cumsum([*sizes.values()])
     signals = dict(zip(sizes, np.split(recording["replay/signals"], ends[:-1], axis=1), strict=True))
-    columns = {name: recording[f"replay/{name}"] for name in ("reset", "pose", "command")}
+    columns: dict[str, Any] = {name: recording[f"replay/{name}"] for name in ("reset", "pose", "command")}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{name: signals[name] for name in signals if name not in COMPUTED}, **columns)
+    columns |= {name: signals[name] for name in signals if name not in COMPUTED}
+    np.savez_compressed(buffer, **columns)
     return buffer.getvalue()
 
 

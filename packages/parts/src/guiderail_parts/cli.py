@@ -5,7 +5,7 @@ from typing import Annotated
 
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
+from guiderail.tools.cli.app import argument, command, option, print_message, print_progress, print_result
 
 POSE = "x,y,z,rx,ry,rz"
 
@@ -74,9 +74,13 @@ def create_task(
     )
     if not as_json:
         created |= {f"hard_{name}": value for name, value in created.pop("hard", {}).items()}
-        labels = {"modulus": "modulus [Pa]", "force": "force [N]", "hard_force_limit": "hard force limit [N]"}
+        labels = {"total_s": "CPU time [s]", "hard_seconds": "CPU time of hard [s]"}
+        labels |= {"modulus": "modulus [Pa]", "force": "force [N]", "hard_force_limit": "hard force limit [N]"}
         created = {labels.get(name, name): value for name, value in created.items()}
     print_result(created, as_json)
+    if not as_json:
+        chosen = "--env difficulty=hard --episodes 40" if hard_episodes else "--episodes 60"
+        print_message(f"next: guiderail train {out} {chosen} --out runs/{out.name}")
 
 
 @command("create-tasks meshes --unit m --out parts --processes 2", "create-tasks")

@@ -363,7 +363,8 @@ def _measure(
         log(
             f"on the rim, drag / normal force is {ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s and {step:g} ms a step, and "
             f"the friction {contact_on_rim.friction:g}: the contact has not converged, or edges of the socket's mouth "
-            "hold back a sliding plug; check policies at shorter steps and in another engine (guiderail converge)"
+            "hold back a sliding plug. The task can be trained; before numbers are quoted, check the policy at shorter "
+            "steps and in another engine (guiderail converge)"
         )
     measured = {
         **prepared,
@@ -442,6 +443,7 @@ def _write_task(
     if hard_episodes:
         mesh = read_obj(folder / file.plug.visual)
         radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
+        log("calibrating difficulty=hard: several times as long as the demonstrations; --hard-episodes 0 leaves it out")
         file = calibrate(folder, file, radius, hard_episodes, log)
         if "hard" in file.measured:
             file.measured["hard"]["seconds"] = round(_seconds_since(start) - measured["total_s"], 2)

@@ -9,6 +9,7 @@ is tared before the episode. Every command satisfies `skill.law.primitive.constr
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -27,14 +28,14 @@ class Skill:
         law: Law that turns actions into poses within the constraints.
     """
 
-    def __init__(self, folder=Path(__file__).parent):
+    def __init__(self, folder: Path | str = Path(__file__).parent) -> None:
         self._about = json.loads((Path(folder) / "skill.json").read_text())
         self.entries = self._about["observation"]
         self._policy = onnxruntime.InferenceSession(Path(folder) / self._about["policy"])
         self.law, self.period = load_law(folder), self._about["control_period_s"]
         self.num_steps = self.law.primitive.num_steps
 
-    def start(self, pose):
+    def start(self, pose: Any) -> None:
         """Begin an episode at the measured pose."""
         contact = self._about["contact"]
         self._contact = ContactPointMean(contact["min_force"], contact["memory_s"] / self.period)
@@ -42,11 +43,11 @@ class Skill:
         # Before the first command, the policy observes the command of an action of zero.
         self._command = Stepper(self.law, pose).step(np.zeros(self.law.num_actions)).pose
 
-    def step(self, pose, wrench, **others):
+    def step(self, pose: Any, wrench: Any, **others: Any) -> np.ndarray:
         """Return the pose to command in this control step; `others` are further signals of `skill.json`, if any."""
         pose, wrench, step = np.asarray(pose, float), np.asarray(wrench, float), self._stepper.num_steps
         if step % self._about["action_repeat"] == 0:
-            signals = {"pose": pose, "wrench": wrench, "desired_pose": self._command, **others}
+            signals: dict[str, Any] = {"pose": pose, "wrench": wrench, "desired_pose": self._command, **others}
             signals |= {"time": [step * self.period], "phase": [2.0 * step / self.num_steps - 1.0]}
             if len(wrench) == 6:
                 signals["center_of_pressure"] = center_of_pressure(wrench, self._contact.min_force)
@@ -61,7 +62,7 @@ class Skill:
         return self._command
 
 
-def replay(folder=Path(__file__).parent):
+def replay(folder: Path | str = Path(__file__).parent) -> float:
     """Return the largest difference between the commands of the loop and those of `recording.npz`."""
     skill, recording, largest = Skill(folder), np.load(Path(folder) / "recording.npz"), 0.0
     signals = [name for name in recording.files if name not in ("reset", "pose", "command")]
