@@ -112,8 +112,11 @@ class DiagramEnv(DrakeGymEnv):
     the first step truncates the episode. A failure before the first valid observation is raised, and so is every other
     error.
 
+    `RobotEnv` of packages/hardware overrides `_advance`, whose stop checks it adds, and uses `_begin_episode`, `_info`,
+    `_running`, `_failure`, `_neutral` and `_action_value`: change them together.
+
     Attributes:
-        task: The `TaskDiagram`.
+        diagram: The `TaskDiagram`.
         action_repeat: Control steps per action.
         trace: `EpisodeTrace` of the current episode.
         sampled: Values that the task sampled for the current episode, by name.

@@ -29,6 +29,7 @@ class ActiveConstraintFilter(Diagram):
         input_ports:
         - requested_pose
         - pose
+        - frame_poses (optional)
         output_ports:
         - desired_pose
         - fallback

@@ -14,7 +14,11 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class WrappedStation(Station):
-    """Station around an inner station, which has the methods and attributes that a subclass does not replace."""
+    """Station around an inner station.
+
+    Names that `Station` does not define are those of the inner station. What `Station` defines, such as methods and
+    `wraps_angles`, is replaced here or has the default of `Station`. Subclasses use `_inner`.
+    """
 
     def __init__(self, station: Station):
         """Construct the station; a subclass adds the given `station` to its builder."""

@@ -1,7 +1,7 @@
 """Base class of insertion tasks: a workpiece in the tool and a fixture at an uncertain position.
 
-`InsertionTask` is general. `DemonstratedInsertion` and the rewards, tuned for the connector, are shared with the clamp
-and parts: a change alters all of them.
+`InsertionTask` is general; the clamp derives from it. `DemonstratedInsertion` and its rewards, tuned for the connector,
+are shared with parts: a change alters both.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "onnx": {"onnxruntime": "ONNX Runtime"},
     "wandb": {"wandb": "Weights & Biases"},
     "calibration": {"guiderail_calibration": "guiderail-calibration", "sbi": "sbi"},
-    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot")},
+    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot", "cpp")},
 }
 _SOFTWARE["mujoco"]["guiderail_mujoco"] = "guiderail-mujoco"
 _SOFTWARE["parts"]["guiderail_parts"] = "guiderail-parts"

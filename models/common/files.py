@@ -17,6 +17,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically: readers find the old content or the new, even if the process is killed.
 
     Missing folders are created. Several processes and threads may write the same file; the last content remains.
+    `tools/files.py` finds abandoned temporary files by the last number of their name, the process.
 
     Raises:
         InputError: If the file cannot be written.

@@ -6,8 +6,8 @@ from enum import StrEnum
 class Termination(StrEnum):
     """Reason for the end of an episode; equal to its text, as in `info["termination"]` and in tables.
 
-    A ``termination`` port outputs the index of a reason in the order of this class. The reasons after `TIME_LIMIT` do
-    not come from a port: a program that runs the episode sets them.
+    A ``termination`` port outputs the index of a reason in the order of this class. `TIME_LIMIT` and the reasons
+    after it do not come from a port: the environment or the program that runs the episode sets them.
     """
 
     CONTINUES = ""  # the episode continues

@@ -1,6 +1,7 @@
 """Damped inverse kinematics: joint velocities for a tool velocity, bounded near singular postures.
 
-`LEVER` also scales the violations that `MotionConstraints` reports, and the test of the impedance for regular postures.
+`LEVER` also scales the violations that `MotionConstraints` reports, and the masses of the
+impedance law; joint limits use `TOOL_SCALE`.
 """
 
 import numpy as np

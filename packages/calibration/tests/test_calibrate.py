@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -47,14 +48,17 @@ def test_summaries_tell_robots_apart_more_than_episodes(recorded):
 
 
 def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
-    # A fit uses as many episodes of a draw as were recorded; more would be simulated and not used here.
-    monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", len(load_recordings(recorded / "recordings")))
+    # One recorded episode, and one of each draw: further ones are simulated for coverage, which is not tested here.
+    first = min((recorded / "recordings").glob("*.parquet"))
+    (recorded / "one").mkdir()
+    shutil.copy(first, recorded / "one")
+    monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", 1)
     sentences = []
     arguments = {
         "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 40,
         "predicted": 1, "out": recorded / "out", "processes": 1, "log": sentences.append,
     }  # fmt: skip
-    result = calibrate(RUN, recorded / "recordings", **arguments)
+    result = calibrate(RUN, recorded / "one", **arguments)
     (row,) = result["parameters"]
     assert row["identifiable"] == "yes"
     # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 40 draws.
@@ -77,7 +81,7 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
         raise AssertionError("simulated again")
 
     monkeypatch.setattr("guiderail_calibration.simulations._write", refuse)
-    again = calibrate(RUN, recorded / "recordings", **arguments)
+    again = calibrate(RUN, recorded / "one", **arguments)
     assert again["parameters"] == result["parameters"]
 
 

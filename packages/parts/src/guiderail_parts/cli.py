@@ -79,7 +79,7 @@ def create_task(
         created = {labels.get(name, name): value for name, value in created.items()}
     print_result(created, as_json)
     if not as_json:
-        chosen = "--env difficulty=hard --episodes 40" if hard_episodes else "--episodes 60"
+        chosen = "--difficulty hard --episodes 40" if hard_episodes else "--episodes 60"
         print_message(f"next: guiderail train {out} {chosen} --out runs/{out.name}")
 
 
