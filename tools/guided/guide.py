@@ -33,9 +33,9 @@ from guiderail.tools.guided.segment import Frame, Segment, as_bool
 PRIMITIVE_GUIDANCE = ("kgrl", "skgrl", "kmp", "residual", "clipped_residual")
 GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 
-# Distance of an episode's start from that of the demonstrations above which a warning names both: multiple of the
-# demonstrations' standard deviation, and fraction of their range; one of two different units exceeds both.
-FAR_DEVIATIONS, FAR_FRACTION = 10.0, 0.1
+# Ratio of two lengths above which a warning states that one of them may have another unit; and fraction of the
+# demonstrations' range that the start of an episode is, in addition, at least away from their start.
+FAR, FAR_FRACTION = 10.0, 0.1
 # Scale of the observed command of a template [m, rad]; a template has no demonstrations that define a range.
 _COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
 
@@ -242,18 +242,31 @@ class PrimitiveGuide(Guide):
         self._begin_segment(0, env, observation)
         if not self._has_begun:
             self._has_begun = True
-            self._warn_of_distant_start()
+            self._warn_of_units()
 
-    def _warn_of_distant_start(self) -> None:
-        """Warn if the pose is so far from the demonstrations' start that one of them may have another unit or frame."""
-        reference = self.segments[0].reference
+    def _warn_of_units(self) -> None:
+        """Warn if pose, demonstrations and constraints are so far apart that one may have another unit or frame."""
+        reference, warn = self.segments[0].reference, gymnasium.logger.warn
         start, deviation = reference.means[0], np.sqrt(np.diag(reference.covariances[0]))
         distance = float(np.linalg.norm(self._last_output - start))
-        if distance > max(FAR_DEVIATIONS * np.linalg.norm(deviation), FAR_FRACTION * np.ptp(reference.means, 0).max()):
-            gymnasium.logger.warn(
+        if distance > max(FAR * np.linalg.norm(deviation), FAR_FRACTION * np.ptp(reference.means, 0).max()):
+            warn(
                 f"the first episode begins at {_numbers(self._last_output)}, and the demonstrations at "
                 f"{_numbers(start)} with standard deviations {_numbers(deviation)}: check units and frames of the "
                 "measured pose and of the demonstrations"
+            )
+        nearest = np.array([self.constraints.nearest(mean, step) for step, mean in enumerate(reference.means)])
+        outside, extent = np.median(np.linalg.norm(reference.means - nearest, axis=1)), np.ptp(nearest, 0).max()
+        if outside > FAR * extent:
+            warn(
+                f"at half of the steps the demonstrations are outside of the constraints by {outside:.3g} or more, and "
+                f"within the constraints the motion extends over {extent:.3g}: check the units of both"
+            )
+        extents = [np.ptp(outputs, 0).max() for outputs in self.segments[0].segment.recorded.outputs]
+        if max(extents) > FAR * np.median(extents):
+            warn(
+                f"demonstration {np.argmax(extents)} extends over {max(extents):.3g}, and the median one over "
+                f"{np.median(extents):.3g}: check its unit"
             )
 
     def _begin_segment(self, index: int, env: Any, observation: Any) -> None:

@@ -65,6 +65,23 @@ def test_exported_loop_replays_the_recording(exported):
     assert float(result.stdout.partition(": ")[2].split()[0]) < 1e-6
 
 
+def test_exported_loop_names_the_missing_extra(exported, tmp_path):
+    _, folder, _ = exported
+    loop = str(folder / "loop.py")
+    code = f"import sys, runpy; sys.modules['onnxruntime'] = None; runpy.run_path({loop!r}, run_name='__main__')"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "guiderail[onnx]" in result.stderr
+
+
+def test_exported_loop_refuses_measurements_that_are_not_finite(exported):
+    _, folder, loop = exported
+    skill = loop.Skill()
+    skill.start(np.load(folder / "recording.npz")["pose"][0])
+    with pytest.raises(ValueError, match="pose and wrench must be finite"):
+        skill.step([np.nan] * skill.law.num_outputs, ())
+
+
 def test_exported_loop_commands_what_the_environment_commands(exported):
     name, _, loop = exported
     config = RunFolder(find_run(f"pretrained:{name}")).config()

@@ -616,6 +616,18 @@ def test_pose_in_another_unit_than_the_demonstrations_is_warned_of_once():
         env.reset(seed=1)
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [(range(5), "the demonstrations are outside of the constraints by"), ([3], "demonstration 3 extends over")],
+)
+def test_demonstrations_in_another_unit_than_constraints_or_each_other_are_warned_of(changed, message):
+    outputs = [1e3 * each if number in changed else each for number, each in enumerate(RECORDED.outputs)]
+    box = LinearConstraints.box([-0.6] * 3, [0.1] * 3)
+    env = make_guided(demonstrations=Demonstrations(RECORDED.times, outputs), constraints=box)
+    with pytest.warns(UserWarning, match=message):
+        env.reset(seed=0)
+
+
 def test_start_at_the_demonstrations_causes_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -80,6 +80,11 @@ def create_task(
     print_result(created, as_json)
     if not as_json:
         chosen = "--difficulty hard --episodes 40" if hard_episodes else "--episodes 60"
+        if hard_episodes and not created.get("hard_calibrated", True):
+            print_message(
+                "difficulty=hard is not calibrated: compare a policy with the baselines of guiderail evaluate, because "
+                "random actions may solve it, or the scripted search may not"
+            )
         print_message(f"next: guiderail train {out} {chosen} --out runs/{out.name}")
 
 

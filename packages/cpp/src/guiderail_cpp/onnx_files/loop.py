@@ -8,12 +8,13 @@ is tared before the episode. Every command satisfies `skill.law.primitive.constr
 """
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
+from guiderail.models.common.errors import InputError, require_extra
 from guiderail.models.control.wrench import ContactPointMean, center_of_pressure
 from guiderail.models.laws import Stepper, load_law
 
@@ -31,6 +32,9 @@ class Skill:
     def __init__(self, folder: Path | str = Path(__file__).parent) -> None:
         self._about = json.loads((Path(folder) / "skill.json").read_text())
         self.entries = self._about["observation"]
+        require_extra("onnxruntime")
+        import onnxruntime
+
         self._policy = onnxruntime.InferenceSession(Path(folder) / self._about["policy"])
         self.law, self.period = load_law(folder), self._about["control_period_s"]
         self.num_steps = self.law.primitive.num_steps
@@ -46,6 +50,8 @@ class Skill:
     def step(self, pose: Any, wrench: Any, **others: Any) -> np.ndarray:
         """Return the pose to command in this control step; `others` are further signals of `skill.json`, if any."""
         pose, wrench, step = np.asarray(pose, float), np.asarray(wrench, float), self._stepper.num_steps
+        if not (np.isfinite(pose).all() and np.isfinite(wrench).all()):
+            raise ValueError("pose and wrench must be finite: stop the robot, or hold the last command")
         if step % self._about["action_repeat"] == 0:
             signals: dict[str, Any] = {"pose": pose, "wrench": wrench, "desired_pose": self._command, **others}
             signals |= {"time": [step * self.period], "phase": [2.0 * step / self.num_steps - 1.0]}
@@ -76,4 +82,8 @@ def replay(folder: Path | str = Path(__file__).parent) -> float:
 
 
 if __name__ == "__main__":
-    print(f"largest difference from the recorded commands: {replay():.1e} m or rad")
+    try:
+        print(f"largest difference from the recorded commands: {replay():.1e} m or rad")
+    except InputError as error:
+        print(f"loop.py: {error}", file=sys.stderr)
+        sys.exit(2)
