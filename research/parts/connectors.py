@@ -6,7 +6,6 @@ cylinders and frames are taken; visual meshes, masses and inertias are not.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 import trimesh
 from manifold3d import Manifold, OpType
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.files import write_atomically
+from guiderail.tools.tables import table_text
 from guiderail_parts.geometry.assembly_check import MAX_RESTING_OVERLAP, measure_overlap, measure_side_clearance
 from guiderail_parts.geometry.mesh_file import load_part
 from guiderail_parts.geometry.solids import to_arrays
@@ -235,13 +237,14 @@ def main(arguments: list[str]) -> None:
         measured = write_connector(args.models, connector, args.out / name)
         rows.append({"name": name, **measured})
     table = args.out / "pairs.csv"
-    columns = ("name", "plug", "socket", "unit", "friction", "force_limit")
-    with table.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
-        writer.writeheader()
-        for row in rows:
-            files = {part: f"{row['name']}/{part}.stl" for part in ("plug", "socket")}
-            writer.writerow({**row, **files, "unit": "mm", "force_limit": FORCE_LIMIT})
+    pairs = [
+        {
+            "name": row["name"], "plug": f"{row['name']}/plug.stl", "socket": f"{row['name']}/socket.stl", "unit": "mm",
+            "friction": row["friction"], "force_limit": FORCE_LIMIT,
+        }
+        for row in rows
+    ]  # fmt: skip
+    write_atomically(table, table_text(pd.DataFrame(pairs)).encode())
     print_rows(table, rows, as_json=args.json)
 
 
