@@ -215,8 +215,9 @@ def create_task(
         measured, search, first_contact = _measure(folder, task, choice, prepared, start, log)
         if not only_insert:
             task = task.model_copy(update={"search": search, "motion": _touching_at(task, first_contact, log)})
-            from guiderail_parts.trial import add_convex_pieces
+            from guiderail_parts.trial import add_contact_map, add_convex_pieces
 
+            task = add_contact_map(folder, task, log)
             if not (scenarios or choice.contact.snapping):
                 task = add_convex_pieces(folder, task, surfaces, tolerance, log)
             measured = _write_task(folder, task, choice, measured, hard_episodes, start, log)

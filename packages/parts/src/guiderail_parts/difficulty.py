@@ -20,8 +20,8 @@ from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail_parts.geometry.demonstrator import SEARCH_END
 from guiderail_parts.isolation import IsolatedError, run_isolated
-from guiderail_parts.task import IN_SOCKET, TIME, Z, load_task_folder
-from guiderail_parts.task_file import PartTaskFile, read_task_file
+from guiderail_parts.task import TIME, Z, load_task_folder
+from guiderail_parts.task_file import IN_SOCKET, PartTaskFile, read_task_file
 
 MAX_RANDOM, MIN_SCRIPTED = 0.2, 0.9  # success rates of random actions and of the search in a hard setting
 SEED = 3_000_000  # seed of the first episode; conditions are sampled as in training

@@ -37,6 +37,7 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
+    MIN_CONTACT_FORCE,
     length_field,
 )
 from guiderail.diagrams.tasks.task import Condition
@@ -49,12 +50,14 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.movement_primitive import HistoryBuffer
 from guiderail.tools.learning.learner_config import resolve_preset
+from guiderail_parts.contact_map import ContactMap, SocketEstimator
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
 from guiderail_parts.geometry.obj_file import read_obj
 from guiderail_parts.task_file import (
     AUTOMATE,
     FILE_NAME,
+    IN_SOCKET,
     Bounds,
     PartTaskFile,
     read_task_file,
@@ -131,7 +134,6 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
-IN_SOCKET = 0.5 * MM  # depth below the first contact from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
 MIN_PUSH = 1.5 * MM  # smallest displacement of the command by a push on a seated plug, in addition to the play [m]
 FOLLOWING = 3.0  # rate of change of the action per 2 mm of distance between the command and a plug in the socket [1/s]
@@ -141,7 +143,7 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
 # Observation "shared": scales of heights and distances [m], and delays of the progress [s].
-NEAR, SLIDING, PROGRESS = 5.0 * MM, 1.0 * MM, 1.0 * MM
+NEAR, SLIDING, PROGRESS, UNCERTAINTY = 5.0 * MM, 1.0 * MM, 1.0 * MM, 3.0 * MM
 DELAYS = (0.2, 0.6)
 COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale as in the other observations [N]
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
@@ -228,8 +230,8 @@ class PartInsertion(DemonstratedInsertion):
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
     a policy of many parts: "center_of_pressure" with forces relative to the force limit, lateral positions relative to
     the reach of an action, and the lever arm with the part's measured sign; then the height above the measured first
-    contact, the distance of the plug from the command (laterally relative to the clearance), and the plug's progress
-    in the last 0.2 and 0.6 s, which shows whether anything moves.
+    contact, the distance of the plug from the command (laterally relative to the clearance), the plug's progress in
+    the last 0.2 and 0.6 s, which shows whether anything moves, and the socket's axis as estimated by `SocketEstimator`.
     """
 
     workpiece, fixture = PLUG, SOCKET
@@ -381,6 +383,7 @@ class PartInsertion(DemonstratedInsertion):
             ObservationTerm("pose", file.motion.first_contact, NEAR, (2,)),
             ObservationTerm("lag", 0.0, lag),
             ObservationTerm("progress", 0.0, PROGRESS),
+            ObservationTerm("socket_offset", 0.0, np.array([reach, reach, UNCERTAINTY])),
             *self.force_limit_terms(),
         )
         return Observed(terms, privileged=PRIVILEGED)
@@ -392,10 +395,10 @@ class PartInsertion(DemonstratedInsertion):
         return float(np.sqrt(3.0) * self.defaults.get("action_scale", 1.0) * np.sqrt((lateral**2).mean()))
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the signals of `DemonstratedInsertion`; for "shared" also `lag` (3,) and `progress` (6,) [m].
+        """Return the signals of `DemonstratedInsertion`; for "shared" also `lag`, `progress` and `socket_offset` [m].
 
-        `lag` is the position of the plug minus that of the command. `progress` is the displacement since each of
-        `DELAYS`.
+        `lag` (3,) is the position of the plug minus that of the command. `progress` (6,) is the displacement since each
+        of `DELAYS`. `socket_offset` (3,) is the output of `SocketEstimator`.
         """
         signals = super().signals(builder, station)
         if self.observation != "shared":
@@ -420,7 +423,21 @@ class PartInsertion(DemonstratedInsertion):
             oldest = 3 + 3 * (max(steps) - delay)
             D[3 * row : 3 * row + 3, oldest : oldest + 3] = -np.eye(3)
         progress = add_system(builder, "progress", affine(D, np.zeros(len(D))), joined.get_output_port())
-        return {**signals, "lag": lag.get_output_port(), "progress": progress.get_output_port()}
+        estimator = SocketEstimator(
+            self._contact_map,
+            min_force=MIN_CONTACT_FORCE,
+            lowest=self.file.motion.first_contact - IN_SOCKET,
+            period=station.control_period,
+        )
+        wrench = station.GetOutputPort("wrench")
+        offset = add_system(builder, "socket_estimator", estimator, pose, wrench).get_socket_offset_output_port()
+        added = {"lag": lag, "progress": progress}
+        return {**signals, **{name: system.get_output_port() for name, system in added.items()}, "socket_offset": offset}
+
+    @cached_property
+    def _contact_map(self) -> ContactMap | None:
+        name = self.file.search.contact_map
+        return None if name is None else ContactMap.load(self.folder / name)
 
     def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return success at the target, and collision above the force limit."""
@@ -467,7 +484,7 @@ def _no_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
 def _shared_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the matrices of the last entries of "shared" for a rotation or reflection across the axis (2, 2)."""
     moved = block_diag(across, np.eye(1))
-    return (np.eye(1), *[moved] * (1 + len(DELAYS)))
+    return (np.eye(1), *[moved] * (2 + len(DELAYS)))
 
 
 RIM_OFFSET = 1.5 * MM  # displacement at which a plug is pressed on the rim [m]

@@ -57,6 +57,7 @@ AUTOMATE: dict[str, Any] = {
 }
 """Options of difficulty="automate": AutoMate's uncertainty, ±2 mm along x and y and ±5° about the axis."""
 _LARGEST = float(np.finfo(float).max)
+IN_SOCKET = 0.5 * MM  # depth below the first contact from which a plug is in the socket [m]
 MAX_CLEARANCE = 500.0  # largest accepted clearance [mm], equal to the largest size of a part
 # Largest bound of a command [m], [rad]: larger bounds are probably in millimeters or degrees. A command may approach
 # from the side, start at the largest `travel`, and turn by 180° plus a `search_turn`.
@@ -289,6 +290,9 @@ class SearchNumbers(Options):
         -1,
         description="1 if a misaligned plug's center of pressure lies towards the socket's axis, -1 if away from it",
     )
+    contact_map: str | None = Field(
+        None, description="file in the task folder with the measured contact map; default: none, the rim was not touched"
+    )
     speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
     turn_speed: Number = Field(0.5, gt=0, le=10, description="change of the action that turns the plug [1/s]")
 
@@ -379,7 +383,8 @@ class PartTaskFile(Options):
         models = (self.plug, self.socket)
         meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
         convex = [file for model in models for file in model.convex if file not in meshes]
-        return (*meshes, *convex, self.demonstrations.file, *self.scenario)
+        maps = [self.search.contact_map] if self.search.contact_map is not None else []
+        return (*meshes, *convex, self.demonstrations.file, *maps, *self.scenario)
 
     @property
     def is_convex(self) -> bool:

@@ -26,6 +26,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
+from guiderail_parts.contact_map import measure_contact_map
 from guiderail_parts.geometry.demonstrator import demonstrator_motions, socket_offsets, socket_turns
 from guiderail_parts.geometry.drake_check import piece_text
 from guiderail_parts.geometry.obj_file import read_obj
@@ -210,6 +211,23 @@ def measure_first_contact(trials: Sequence[Trial]) -> float | None:
         if (touches := np.asarray(recording["wrench"])[:, 2] >= MIN_CONTACT_FORCE).any()
     ]
     return float(np.median(heights)) if heights else None
+
+
+CONTACT_MAP = "contact_map.csv"  # name of the file in a task folder
+
+
+def add_contact_map(folder: Path, file: PartTaskFile, log: Callable[[str], None]) -> PartTaskFile:
+    """Measure the contact map, write it into the folder, and return the task file that names it.
+
+    The file is returned unchanged if the plug never touches the rim.
+    """
+    contact_map = measure_contact_map(GantryStation(write_workcell(folder, file), time_step=file.time_step), file.motion)
+    if contact_map is None:
+        log("the plug never touched the rim, so there is no contact map: a general policy has to find the socket blindly")
+        return file
+    contact_map.save(folder / CONTACT_MAP)
+    log(f"contact map: {len(contact_map.positions)} samples on the rim")
+    return file.model_copy(update={"search": file.search.model_copy(update={"contact_map": CONTACT_MAP})})
 
 
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}

@@ -1,0 +1,231 @@
+"""Contact map of two parts, and the socket's position that a plug on the rim estimates with it.
+
+Where a misaligned plug touches a socket depends on the shapes of both, so that the direction from the center of
+pressure to the socket's axis differs from part to part. The map is measured in simulation, before any episode:
+`create-task` presses the plug on the rim at random positions. In an episode, a histogram filter compares the centers of
+pressure with the map, as in Chhatpar and Branicky, "Particle filtering for localization in robotic assemblies with
+position uncertainty" (IROS 2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
+from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import read_bytes, write_atomically
+from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE, WRENCH_SIZE
+from guiderail.models.control.wrench import center_of_pressure
+from guiderail.models.primitives.kernels import SquaredExponential
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail_parts.task_file import IN_SOCKET, MotionNumbers
+
+RADIUS = 4.25 * MM  # largest distance of the socket from its nominal position in the filter [m]
+SPACING = 0.25 * MM  # distance of the filter's positions and of the map's table [m]
+EXTENT = 7.0 * MM  # largest |x| and |y| of the plug relative to the socket in the map's table [m]
+LENGTH_SCALE, NOISE = 0.7 * MM, 0.05  # of the regression [m]; variance of a sample relative to that of the map
+NEAR = 0.4 * MM  # distance over which the variance of samples is averaged [m]
+MIN_DEVIATION = 0.2 * MM  # smallest standard deviation of a center of pressure from the map [m]
+RATE = 0.25  # weight of one sample: consecutive samples are not independent
+OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to the largest likelihood
+COLUMNS = ("x", "y", "center_x", "center_y")  # of the file [mm]
+MAX_FILE_SIZE = 1 << 20  # [bytes]
+MAX_SAMPLES = 600  # largest number of samples that a regression uses
+FORGETTING = 0.99  # factor of the log-probabilities per sample, so that wrong early samples are forgotten
+
+
+def histogram_positions() -> np.ndarray:
+    """Return the positions of the socket relative to its nominal position that the filter distinguishes, (H, 2) [m]."""
+    ticks = SPACING * np.arange(-round(RADIUS / SPACING), round(RADIUS / SPACING) + 1)
+    positions = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
+    return positions[np.hypot(*positions.T) <= RADIUS]
+
+
+@dataclass(frozen=True)
+class ContactMap:
+    """Centers of pressure of a plug on the rim, by the plug's position relative to the socket.
+
+    Args:
+        positions: Positions of the plug relative to the socket, x and y, (N, 2) [m].
+        centers: Center of pressure at each position, relative to the tool center, (N, 2) [m].
+
+    Raises:
+        InputError: If the arrays are not finite or not of these shapes.
+    """
+
+    positions: np.ndarray
+    centers: np.ndarray
+
+    def __post_init__(self) -> None:
+        shape = self.positions.shape
+        if len(shape) != 2 or not shape[0] or shape[1] != 2 or self.centers.shape != shape:
+            raise InputError("a contact map has positions (N, 2) and as many centers of pressure (N, 2)")
+        if not (np.isfinite(self.positions).all() and np.isfinite(self.centers).all()):
+            raise InputError("a contact map has values that are not finite")
+
+    @classmethod
+    def load(cls, path: Path) -> ContactMap:
+        """Read a file that `save` wrote.
+
+        Raises:
+            InputError: If the file is missing, damaged or not a contact map.
+        """
+        text = read_bytes(path, "contact map", MAX_FILE_SIZE).decode(errors="replace")
+        try:
+            rows = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise InputError(f"{path} is not a contact map ({brief(error)}): create the task again") from error
+        if rows.shape[1:] != (len(COLUMNS),):
+            raise InputError(f"{path} is not a contact map: its columns are {','.join(COLUMNS)}")
+        return cls(MM * rows[:, :2], MM * rows[:, 2:])
+
+    def save(self, path: Path) -> None:
+        """Write the samples as a table, in millimeters."""
+        text = StringIO()
+        rows = np.hstack([self.positions, self.centers]) / MM
+        np.savetxt(text, rows, fmt="%.4f", delimiter=",", header=",".join(COLUMNS), comments="")
+        write_atomically(path, text.getvalue().encode())
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        """Mean (2) and variance (1) of the center of pressure on a grid of relative positions, (M, M, 3) [m, m²]."""
+        every = -(-len(self.positions) // MAX_SAMPLES)
+        positions, centers = self.positions[::every], self.centers[::every]
+        kernel, mean = SquaredExponential(LENGTH_SCALE), centers.mean(axis=0)
+        K = kernel(positions, positions) + NOISE * np.eye(len(positions))
+        weights = np.linalg.solve(K, centers - mean)
+        errors = ((centers - mean - kernel(positions, positions) @ weights) ** 2).mean(axis=1)
+        ticks = SPACING * np.arange(-round(EXTENT / SPACING), round(EXTENT / SPACING) + 1)
+        grid = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
+        predicted = mean + kernel(grid, positions) @ weights
+        # Without a sample nearby, the variance is that of all centers of pressure.
+        near, whole = SquaredExponential(NEAR)(grid, positions), centers.var(axis=0).mean()
+        variance = (near @ errors + whole) / (near.sum(axis=1) + 1.0) + MIN_DEVIATION**2
+        return np.column_stack([predicted, variance]).reshape(len(ticks), len(ticks), 3)
+
+    def log_likelihood(self, plug: np.ndarray, center: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of each position of the socket, (H,).
+
+        Args:
+            plug: Position of the plug, x and y, (2,) [m].
+            center: Its center of pressure, (2,) [m].
+            positions: Positions of the socket, (H, 2) [m].
+        """
+        table = self._table
+        i, j = np.clip(np.rint((plug - positions + EXTENT) / SPACING).astype(int), 0, len(table) - 1).T
+        mean, variance = table[i, j, :2], table[i, j, 2]
+        likelihood = np.exp(-0.5 * ((mean - center) ** 2).sum(axis=1) / variance) / variance
+        return np.asarray(np.log(likelihood + OUTLIERS / table[:, :, 2].max()))
+
+
+class SocketEstimator(LeafSystem):
+    """Estimate the socket's axis relative to the plug with a histogram filter.
+
+        log P(s) ← γ log P(s) + r log p(c | p − s)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
+        socket_offset = (Σ P(s) s − p, σ)
+
+    s is a position of the socket (`histogram_positions`), p that of the plug in x and y, c the center of pressure, and
+    σ the standard deviation of s. All positions within `RADIUS` of the nominal one are initially equally likely.
+
+    ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
+    finite are skipped. ``socket_offset`` is (3,), x, y and σ [m]. A sample affects the output from the next control
+    step.
+
+    Args:
+        contact_map: Map of the parts; None leaves all positions equally likely.
+        min_force: Force along z below which a sample is not used [N].
+        lowest: Height of the plug below which it is in the socket, and a sample is not used [m].
+        period: Control period [s], positive.
+    """
+
+    def __init__(self, contact_map: ContactMap | None, *, min_force: float, lowest: float, period: float):
+        super().__init__()
+        self._map, self._min_force, self._lowest = contact_map, min_force, lowest
+        self._positions = histogram_positions()
+        self._state = self.DeclareDiscreteState(len(self._positions))  # log-probabilities, up to a constant
+        self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
+        self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
+        self._estimate = declare.cache(self, "estimate", self._calc_estimate, [self._state])
+        declare.output(self, "socket_offset", 3, self._socket_offset, [self._pose_port, self._state])
+        declare.update(self, period, self._update, declare.reset_to_default(self))
+
+    get_pose_input_port = input_getter("pose", "pose of the plug, (6,)")
+    get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
+    get_socket_offset_output_port = output_getter("socket_offset", "x, y and their standard deviation, (3,) [m]")
+
+    def _log_probabilities(self, context: Context) -> np.ndarray:
+        return context.get_discrete_state().value(self._state)
+
+    def _calc_estimate(self, context: Context) -> np.ndarray:
+        log_probabilities = self._log_probabilities(context)
+        weights = np.exp(log_probabilities - log_probabilities.max())
+        weights /= weights.sum()
+        mean = weights @ self._positions
+        return np.array([*mean, np.sqrt(weights @ ((self._positions - mean) ** 2).sum(axis=1))])
+
+    def _socket_offset(self, context: Context) -> np.ndarray:
+        x, y, deviation = self._estimate.Eval(context)
+        plug = self._pose_port.Eval(context)
+        return np.array([x - plug[0], y - plug[1], deviation])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        pose, wrench = self._pose_port.Eval(context), self._wrench_port.Eval(context)
+        if self._map is None or not (is_finite(pose) and is_finite(wrench)):
+            return
+        if wrench[2] < self._min_force or pose[2] < self._lowest:
+            return
+        center = center_of_pressure(wrench, self._min_force)
+        change = RATE * self._map.log_likelihood(pose[:2], center, self._positions)
+        discrete_state.set_value(self._state, FORGETTING * self._log_probabilities(context) + change)
+
+
+# Motion that measures a map: the plug touches the rim at random places and slides on it.
+TOUCHES = 40
+HEIGHT = 1.0 * MM  # height above the first contact between two touches [m]
+DESCENT, SLIDE, LIFT, TRAVERSE = 0.3, 0.4, 0.15, 0.2  # durations [s]
+MAX_SLIDE = 3.0 * MM  # largest length of a slide [m]
+TURN = 2.0 * DEGREE  # largest turn of the plug [rad]
+
+
+def plan_touches(motion: MotionNumbers, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) [s] and poses (N, 6) [m, rad] of `TOUCHES` touches of the rim."""
+    rng = np.random.default_rng(seed)
+    turn = float(motion.plan_search()[1][0, 3])
+    high, low = motion.first_contact + HEIGHT, motion.first_contact - motion.press
+    durations, poses = [0.0], [np.array([0.0, 0.0, high, turn, 0.0, 0.0])]
+
+    def draw() -> np.ndarray:
+        radius, angle = RADIUS * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
+        return radius * np.array([np.cos(angle), np.sin(angle)])
+
+    for _ in range(TOUCHES):
+        start, end, yaw = draw(), draw(), turn + rng.uniform(-TURN, TURN)
+        end = start + (end - start) * min(1.0, MAX_SLIDE / max(float(np.linalg.norm(end - start)), 1e-9))
+        for duration, xy, z in ((TRAVERSE, start, high), (DESCENT, start, low), (SLIDE, end, low), (LIFT, end, high)):
+            durations.append(duration)
+            poses.append(np.array([*xy, z, yaw, 0.0, 0.0]))
+    return np.cumsum(durations), np.array(poses)
+
+
+def measure_contact_map(station: Station, motion: MotionNumbers) -> ContactMap | None:
+    """Return the map of the parts of a station, whose socket is at its nominal position.
+
+    None if the plug never touched the rim. The station becomes part of a diagram.
+    """
+    _, recording = drive_along(station, *plan_touches(motion))
+    wrench, pose = recording["wrench"], recording["pose"]
+    on_rim = (wrench[:, 2] >= MIN_CONTACT_FORCE) & (pose[:, 2] >= motion.first_contact - IN_SOCKET)
+    if not on_rim.any():
+        return None
+    centers = [center_of_pressure(sample, MIN_CONTACT_FORCE) for sample in wrench[on_rim]]
+    return ContactMap(pose[on_rim, :2], np.array(centers))
