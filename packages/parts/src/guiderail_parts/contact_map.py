@@ -35,6 +35,7 @@ SPACING = 0.25 * MM  # distance of the filter's positions and of the map's table
 EXTENT = 7.0 * MM  # largest |x| and |y| of the plug relative to the socket in the map's table [m]
 LENGTH_SCALE, NOISE = 0.7 * MM, 0.05  # of the regression [m]; variance of a sample relative to that of the map
 NEAR = 0.4 * MM  # distance over which the variance of samples is averaged [m]
+WEAK = 0.05  # number of samples that the variance of all centers of pressure counts as
 MIN_DEVIATION = 0.2 * MM  # smallest standard deviation of a center of pressure from the map [m]
 RATE = 0.25  # weight of one sample: consecutive samples are not independent
 OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to the largest likelihood
@@ -110,7 +111,7 @@ class ContactMap:
         predicted = mean + kernel(grid, positions) @ weights
         # Without a sample nearby, the variance is that of all centers of pressure.
         near, whole = SquaredExponential(NEAR)(grid, positions), centers.var(axis=0).mean()
-        variance = (near @ errors + whole) / (near.sum(axis=1) + 1.0) + MIN_DEVIATION**2
+        variance = (near @ errors + WEAK * whole) / (near.sum(axis=1) + WEAK) + MIN_DEVIATION**2
         return np.column_stack([predicted, variance]).reshape(len(ticks), len(ticks), 3)
 
     def log_likelihood(self, plug: np.ndarray, center: np.ndarray, positions: np.ndarray) -> np.ndarray:
