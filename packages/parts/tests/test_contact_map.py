@@ -9,7 +9,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail_parts.contact_map import EXTENT, RADIUS, ContactMap, SocketEstimator, histogram_positions
+from guiderail_parts.contact_map import RADIUS, ContactMap, SocketEstimator, histogram_positions
 
 PERIOD = 0.02
 SOCKET = np.array([2.0, -1.5]) * MM
@@ -21,7 +21,7 @@ def center_at(relative):
 
 
 def linear_map():
-    positions = np.random.default_rng(0).uniform(-EXTENT, EXTENT, (500, 2))
+    positions = np.random.default_rng(0).uniform(-6.0 * MM, 6.0 * MM, (600, 2))
     return ContactMap(positions, np.array([center_at(position) for position in positions]))
 
 

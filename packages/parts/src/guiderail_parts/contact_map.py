@@ -82,12 +82,13 @@ class ContactMap:
             InputError: If the file is missing, damaged or not a contact map.
         """
         text = read_bytes(path, "contact map", MAX_FILE_SIZE).decode(errors="replace")
+        header, *lines = text.splitlines() or [""]
+        if not lines or header != ",".join(COLUMNS):
+            raise InputError(f"{path} is not a contact map: its columns are {','.join(COLUMNS)}")
         try:
-            rows = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
+            rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         except ValueError as error:
             raise InputError(f"{path} is not a contact map ({brief(error)}): create the task again") from error
-        if rows.shape[1:] != (len(COLUMNS),):
-            raise InputError(f"{path} is not a contact map: its columns are {','.join(COLUMNS)}")
         return cls(MM * rows[:, :2], MM * rows[:, 2:])
 
     def save(self, path: Path) -> None:
