@@ -431,8 +431,8 @@ class PartInsertion(DemonstratedInsertion):
         )
         wrench = station.GetOutputPort("wrench")
         offset = add_system(builder, "socket_estimator", estimator, pose, wrench).get_socket_offset_output_port()
-        added = {"lag": lag, "progress": progress}
-        return {**signals, **{name: system.get_output_port() for name, system in added.items()}, "socket_offset": offset}
+        added = {"lag": lag.get_output_port(), "progress": progress.get_output_port(), "socket_offset": offset}
+        return {**signals, **added}
 
     @cached_property
     def _contact_map(self) -> ContactMap | None:

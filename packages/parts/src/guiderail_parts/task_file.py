@@ -291,7 +291,7 @@ class SearchNumbers(Options):
         description="1 if a misaligned plug's center of pressure lies towards the socket's axis, -1 if away from it",
     )
     contact_map: str | None = Field(
-        None, description="file in the task folder with the measured contact map; default: none, the rim was not touched"
+        None, description="file in the task folder with the measured contact map; default: no contact was measured"
     )
     speed: Number = Field(2.0, gt=0, le=10, description="change of the action [1/s]")
     turn_speed: Number = Field(0.5, gt=0, le=10, description="change of the action that turns the plug [1/s]")

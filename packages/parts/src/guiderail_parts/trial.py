@@ -221,9 +221,10 @@ def add_contact_map(folder: Path, file: PartTaskFile, log: Callable[[str], None]
 
     The file is returned unchanged if the plug never touches the rim.
     """
-    contact_map = measure_contact_map(GantryStation(write_workcell(folder, file), time_step=file.time_step), file.motion)
+    station = GantryStation(write_workcell(folder, file), time_step=file.time_step)
+    contact_map = measure_contact_map(station, file.motion)
     if contact_map is None:
-        log("the plug never touched the rim, so there is no contact map: a general policy has to find the socket blindly")
+        log("no contact map: the plug never touched the rim, so a general policy does not know where the socket is")
         return file
     contact_map.save(folder / CONTACT_MAP)
     log(f"contact map: {len(contact_map.positions)} samples on the rim")
