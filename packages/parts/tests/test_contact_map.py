@@ -22,7 +22,7 @@ def center_at(relative):
 
 def linear_map():
     positions = np.random.default_rng(0).uniform(-6.0 * MM, 6.0 * MM, (600, 2))
-    return ContactMap(positions, np.array([center_at(position) for position in positions]))
+    return ContactMap(positions, np.array([center_at(position) for position in positions]), np.ones(600, bool))
 
 
 def estimate(contact_map, *, plugs, force=8.0, height=0.01, center=None):
@@ -49,9 +49,9 @@ PLUGS = np.array([[0.0, 0.0], [1.0, 1.0], [-1.0, 0.5]]) * MM
 
 
 def test_estimate_is_the_socket_relative_to_the_plug():
-    *offset, deviation = estimate(linear_map(), plugs=PLUGS)
+    *offset, xx, _, yy = estimate(linear_map(), plugs=PLUGS)
     np.testing.assert_allclose(offset, SOCKET - PLUGS[-1], atol=0.25 * MM)
-    assert deviation < 0.5 * MM
+    assert max(xx, yy) < (0.3 * MM) ** 2
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,15 @@ def test_estimate_is_the_socket_relative_to_the_plug():
     ids=["no map", "no contact", "in the socket", "not finite"],
 )
 def test_without_usable_samples_every_position_stays_equally_likely(changes):
-    *offset, deviation = estimate(changes.pop("contact_map", linear_map()) if changes else None, plugs=PLUGS, **changes)
+    *offset, xx, _, yy = estimate(changes.pop("contact_map", linear_map()) if changes else None, plugs=PLUGS, **changes)
     np.testing.assert_allclose(offset, -PLUGS[-1], atol=1e-9)
-    assert deviation == pytest.approx(np.sqrt((histogram_positions() ** 2).sum(axis=1).mean()))
+    assert xx == pytest.approx(yy)
+    assert xx + yy == pytest.approx((histogram_positions() ** 2).sum(axis=1).mean())
 
 
 def test_centers_that_contradict_the_map_leave_the_estimate_uncertain():
-    *_, deviation = estimate(linear_map(), plugs=PLUGS, center=(0.3, 0.3))
-    assert deviation > 0.5 * RADIUS
+    *_, xx, _, yy = estimate(linear_map(), plugs=PLUGS, center=(0.3, 0.3))
+    assert min(xx, yy) > (0.3 * RADIUS) ** 2
 
 
 def test_wrong_early_samples_are_forgotten():
@@ -90,10 +91,23 @@ def test_map_is_read_as_written(tmp_path):
     read = ContactMap.load(tmp_path / "contact_map.csv")
     np.testing.assert_allclose(read.positions, written.positions, atol=1e-7)
     np.testing.assert_allclose(read.centers, written.centers, atol=1e-7)
+    assert (read.on_rim == written.on_rim).all()
+
+
+def test_a_plug_that_stays_on_the_rim_excludes_where_it_would_enter():
+    positions = np.random.default_rng(1).uniform(-5.0 * MM, 5.0 * MM, (2000, 2))
+    on_rim = np.hypot(*positions.T) > 1.0 * MM
+    contact_map = ContactMap(positions, np.zeros_like(positions), on_rim)
+    swept = [np.array([x, y]) * MM for x in (-3.0, -1.5, 0.0) for y in (-3.0, -1.5, 0.0, 1.5, 3.0)]
+    x, y, *_ = estimate(contact_map, plugs=swept, center=(0.0, 0.0))
+    assert (swept[-1] + [x, y])[0] > 1.0 * MM
+
+
+HEADER = "x,y,center_x,center_y,on_rim\n"
 
 
 @pytest.mark.parametrize(
-    "text", ["", "x,y\n1,2\n", "x,y,center_x,center_y\n1,2,3,word\n", "x,y,center_x,center_y\n1,2,3,nan\n"]
+    "text", ["", "x,y\n1,2\n", *(HEADER + row for row in ("", "1,2,3,word,1", "1,2,3,nan,1", "1,2,3,4,0"))]
 )
 def test_damaged_file_is_refused(tmp_path, text):
     path = tmp_path / "contact_map.csv"

@@ -39,10 +39,10 @@ WEAK = 0.05  # number of samples that the variance of all centers of pressure co
 MIN_DEVIATION = 0.2 * MM  # smallest standard deviation of a center of pressure from the map [m]
 RATE = 0.25  # weight of one sample: consecutive samples are not independent
 OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to the largest likelihood
-COLUMNS = ("x", "y", "center_x", "center_y")  # of the file [mm]
+COLUMNS = ("x", "y", "center_x", "center_y", "on_rim")  # of the file [mm], the last is 1 or 0
 MAX_FILE_SIZE = 1 << 20  # [bytes]
 MAX_SAMPLES = 600  # largest number of samples that a regression uses
-FORGETTING = 0.99  # factor of the log-probabilities per sample, so that wrong early samples are forgotten
+FORGETTING = 0.995  # factor of the log-probabilities per sample, so that wrong early samples are forgotten
 
 
 def histogram_positions() -> np.ndarray:
@@ -54,25 +54,29 @@ def histogram_positions() -> np.ndarray:
 
 @dataclass(frozen=True)
 class ContactMap:
-    """Centers of pressure of a plug on the rim, by the plug's position relative to the socket.
+    """Samples of a pressed plug, by its position relative to the socket: on the rim or not, and center of pressure.
 
     Args:
         positions: Positions of the plug relative to the socket, x and y, (N, 2) [m].
-        centers: Center of pressure at each position, relative to the tool center, (N, 2) [m].
+        centers: Center of pressure at each position, relative to the tool center, (N, 2) [m]; unused in the socket.
+        on_rim: True where the plug is on the rim, False where it has entered the socket, (N,).
 
     Raises:
-        InputError: If the arrays are not finite or not of these shapes.
+        InputError: If the arrays are not finite or not of these shapes, or no plug is on the rim.
     """
 
     positions: np.ndarray
     centers: np.ndarray
+    on_rim: np.ndarray
 
     def __post_init__(self) -> None:
         shape = self.positions.shape
-        if len(shape) != 2 or not shape[0] or shape[1] != 2 or self.centers.shape != shape:
-            raise InputError("a contact map has positions (N, 2) and as many centers of pressure (N, 2)")
+        if len(shape) != 2 or shape[1] != 2 or self.centers.shape != shape or self.on_rim.shape != shape[:1]:
+            raise InputError("a contact map has as many positions (N, 2) as centers of pressure (N, 2) and flags (N,)")
         if not (np.isfinite(self.positions).all() and np.isfinite(self.centers).all()):
             raise InputError("a contact map has values that are not finite")
+        if not self.on_rim.any():
+            raise InputError("a contact map has samples on the rim")
 
     @classmethod
     def load(cls, path: Path) -> ContactMap:
@@ -89,20 +93,20 @@ class ContactMap:
             rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         except ValueError as error:
             raise InputError(f"{path} is not a contact map ({brief(error)}): create the task again") from error
-        return cls(MM * rows[:, :2], MM * rows[:, 2:])
+        return cls(MM * rows[:, :2], MM * rows[:, 2:4], rows[:, 4] != 0.0)
 
     def save(self, path: Path) -> None:
         """Write the samples as a table, in millimeters."""
         text = StringIO()
-        rows = np.hstack([self.positions, self.centers]) / MM
-        np.savetxt(text, rows, fmt="%.4f", delimiter=",", header=",".join(COLUMNS), comments="")
+        rows = np.column_stack([self.positions / MM, self.centers / MM, self.on_rim])
+        np.savetxt(text, rows, fmt=["%.4f"] * 4 + ["%d"], delimiter=",", header=",".join(COLUMNS), comments="")
         write_atomically(path, text.getvalue().encode())
 
     @cached_property
     def _table(self) -> np.ndarray:
-        """Mean (2) and variance (1) of the center of pressure on a grid of relative positions, (M, M, 3) [m, m²]."""
-        every = -(-len(self.positions) // MAX_SAMPLES)
-        positions, centers = self.positions[::every], self.centers[::every]
+        """Mean (2) and variance of the center of pressure, and probability of the rim, on a grid, (M, M, 4) [m, m²]."""
+        every = -(-int(self.on_rim.sum()) // MAX_SAMPLES)
+        positions, centers = (samples[self.on_rim][::every] for samples in (self.positions, self.centers))
         kernel, mean = SquaredExponential(LENGTH_SCALE), centers.mean(axis=0)
         K = kernel(positions, positions) + NOISE * np.eye(len(positions))
         weights = np.linalg.solve(K, centers - mean)
@@ -113,20 +117,28 @@ class ContactMap:
         # Without a sample nearby, the variance is that of all centers of pressure.
         near, whole = SquaredExponential(NEAR)(grid, positions), centers.var(axis=0).mean()
         variance = (near @ errors + WEAK * whole) / (near.sum(axis=1) + WEAK) + MIN_DEVIATION**2
-        return np.column_stack([predicted, variance]).reshape(len(ticks), len(ticks), 3)
+        # The plug stays on the rim where nothing was measured.
+        every_near = SquaredExponential(NEAR)(grid, self.positions)
+        rim = (every_near @ self.on_rim + WEAK) / (every_near.sum(axis=1) + WEAK)
+        return np.column_stack([predicted, variance, rim]).reshape(len(ticks), len(ticks), 4)
 
     def log_likelihood(self, plug: np.ndarray, center: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of each position of the socket, (H,).
+        """Return the log-likelihood of a sample of a plug on the rim, for each position of the socket.
+
+        A position is unlikely if the center of pressure would be another one, or the plug would enter.
 
         Args:
             plug: Position of the plug, x and y, (2,) [m].
             center: Its center of pressure, (2,) [m].
             positions: Positions of the socket, (H, 2) [m].
+
+        Returns:
+            Log-likelihoods (H,), up to a constant.
         """
         table = self._table
         i, j = np.clip(np.rint((plug - positions + EXTENT) / SPACING).astype(int), 0, len(table) - 1).T
-        mean, variance = table[i, j, :2], table[i, j, 2]
-        likelihood = np.exp(-0.5 * ((mean - center) ** 2).sum(axis=1) / variance) / variance
+        mean, variance, rim = table[i, j, :2], table[i, j, 2], table[i, j, 3]
+        likelihood = rim * np.exp(-0.5 * ((mean - center) ** 2).sum(axis=1) / variance) / variance
         return np.asarray(np.log(likelihood + OUTLIERS / table[:, :, 2].max()))
 
 
@@ -134,13 +146,14 @@ class SocketEstimator(LeafSystem):
     """Estimate the socket's axis relative to the plug with a histogram filter.
 
         log P(s) ← γ log P(s) + r log p(c | p − s)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
-        socket_offset = (Σ P(s) s − p, σ)
+        socket_offset = (m − p, C_xx, C_xy, C_yy),  m = Σ P(s) s,  C = Σ P(s) (s − m) (s − m)ᵀ
 
-    s is a position of the socket (`histogram_positions`), p that of the plug in x and y, c the center of pressure, and
-    σ the standard deviation of s. All positions within `RADIUS` of the nominal one are initially equally likely.
+    s is a position of the socket (`histogram_positions`), p that of the plug in x and y, and c the center of pressure.
+    A plug that stays on the rim excludes the positions at which it would enter. All positions within `RADIUS` of the
+    nominal one are initially equally likely.
 
     ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
-    finite are skipped. ``socket_offset`` is (3,), x, y and σ [m]. A sample affects the output from the next control
+    finite are skipped. ``socket_offset`` is (5,) [m, m²]. A sample affects the output from the next control
     step.
 
     Args:
@@ -158,12 +171,12 @@ class SocketEstimator(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         self._estimate = declare.cache(self, "estimate", self._calc_estimate, [self._state])
-        declare.output(self, "socket_offset", 3, self._socket_offset, [self._pose_port, self._state])
+        declare.output(self, "socket_offset", 5, self._socket_offset, [self._pose_port, self._state])
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_pose_input_port = input_getter("pose", "pose of the plug, (6,)")
     get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
-    get_socket_offset_output_port = output_getter("socket_offset", "x, y and their standard deviation, (3,) [m]")
+    get_socket_offset_output_port = output_getter("socket_offset", "x, y and covariances xx, xy, yy, (5,) [m, m²]")
 
     def _log_probabilities(self, context: Context) -> np.ndarray:
         return context.get_discrete_state().value(self._state)
@@ -173,12 +186,14 @@ class SocketEstimator(LeafSystem):
         weights = np.exp(log_probabilities - log_probabilities.max())
         weights /= weights.sum()
         mean = weights @ self._positions
-        return np.array([*mean, np.sqrt(weights @ ((self._positions - mean) ** 2).sum(axis=1))])
+        distance = self._positions - mean
+        covariance = distance.T @ (weights[:, None] * distance)
+        return np.array([*mean, covariance[0, 0], covariance[0, 1], covariance[1, 1]])
 
     def _socket_offset(self, context: Context) -> np.ndarray:
-        x, y, deviation = self._estimate.Eval(context)
-        plug = self._pose_port.Eval(context)
-        return np.array([x - plug[0], y - plug[1], deviation])
+        offset = self._estimate.Eval(context).copy()
+        offset[:2] -= self._pose_port.Eval(context)[:2]
+        return offset
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose, wrench = self._pose_port.Eval(context), self._wrench_port.Eval(context)
@@ -226,8 +241,9 @@ def measure_contact_map(station: Station, motion: MotionNumbers) -> ContactMap |
     """
     _, recording = drive_along(station, *plan_touches(motion))
     wrench, pose = recording["wrench"], recording["pose"]
-    on_rim = (wrench[:, 2] >= MIN_CONTACT_FORCE) & (pose[:, 2] >= motion.first_contact - IN_SOCKET)
-    if not on_rim.any():
+    on_rim = pose[:, 2] >= motion.first_contact - IN_SOCKET
+    used = ~on_rim | (wrench[:, 2] >= MIN_CONTACT_FORCE)
+    if not (on_rim & used).any():
         return None
-    centers = [center_of_pressure(sample, MIN_CONTACT_FORCE) for sample in wrench[on_rim]]
-    return ContactMap(pose[on_rim, :2], np.array(centers))
+    centers = np.array([center_of_pressure(sample, MIN_CONTACT_FORCE) for sample in wrench[used]])
+    return ContactMap(pose[used, :2], centers, on_rim[used])

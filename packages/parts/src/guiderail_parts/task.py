@@ -143,7 +143,7 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
 # Observation "shared": scales of heights and distances [m], and delays of the progress [s].
-NEAR, SLIDING, PROGRESS, UNCERTAINTY = 5.0 * MM, 1.0 * MM, 1.0 * MM, 3.0 * MM
+NEAR, SLIDING, PROGRESS, UNCERTAINTY = 5.0 * MM, 1.0 * MM, 1.0 * MM, 2.0 * MM
 DELAYS = (0.2, 0.6)
 COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale as in the other observations [N]
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
@@ -383,7 +383,7 @@ class PartInsertion(DemonstratedInsertion):
             ObservationTerm("pose", file.motion.first_contact, NEAR, (2,)),
             ObservationTerm("lag", 0.0, lag),
             ObservationTerm("progress", 0.0, PROGRESS),
-            ObservationTerm("socket_offset", 0.0, np.array([reach, reach, UNCERTAINTY])),
+            ObservationTerm("socket_offset", 0.0, np.array([reach, reach, *[UNCERTAINTY**2] * 3])),
             *self.force_limit_terms(),
         )
         return Observed(terms, privileged=PRIVILEGED)
@@ -398,7 +398,7 @@ class PartInsertion(DemonstratedInsertion):
         """Return the signals of `DemonstratedInsertion`; for "shared" also `lag`, `progress` and `socket_offset` [m].
 
         `lag` (3,) is the position of the plug minus that of the command. `progress` (6,) is the displacement since each
-        of `DELAYS`. `socket_offset` (3,) is the output of `SocketEstimator`.
+        of `DELAYS`. `socket_offset` (5,) is the output of `SocketEstimator`.
         """
         signals = super().signals(builder, station)
         if self.observation != "shared":
@@ -484,7 +484,9 @@ def _no_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
 def _shared_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the matrices of the last entries of "shared" for a rotation or reflection across the axis (2, 2)."""
     moved = block_diag(across, np.eye(1))
-    return (np.eye(1), *[moved] * (2 + len(DELAYS)))
+    (a, b), (c, d) = across
+    covariance = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]])
+    return (np.eye(1), *[moved] * (1 + len(DELAYS)), across, covariance)
 
 
 RIM_OFFSET = 1.5 * MM  # displacement at which a plug is pressed on the rim [m]
