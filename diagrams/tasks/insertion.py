@@ -7,7 +7,7 @@ are shared with parts: a change alters both.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
@@ -288,9 +288,7 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
     return ALIGNMENT_REWARD * float(nearer) / MM
 
 
-def sides_of_the_rim(
-    observation: str, more: Callable[[np.ndarray], Iterable[np.ndarray]] = lambda across: ()
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sides_of_the_rim(observation: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the seven symmetries of a plug on the rim: three turns about the axis, and four reflections.
 
     Vectors across the axis are rotated or reflected. Torques and tilts are axial vectors, so that a reflection also
@@ -299,8 +297,6 @@ def sides_of_the_rim(
 
     Args:
         observation: Name of the observation.
-        more: Function from the transformation of vectors across the axis (2, 2) to the matrices of further entries of
-            the observation.
 
     Returns:
         Matrices of observations (7, n, n), of outputs (7, 6, 6) and of privileged observations (7, 9, 9).
@@ -315,7 +311,7 @@ def sides_of_the_rim(
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
         # center of pressure, commanded x and y, and mean contact point
         contact_terms = (across,) * {"state": 0, "mean_contact_point": 3}.get(observation, 2)
-        observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms, *more(across)))
+        observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms))
         poses.append(pose)
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
     return np.array(observations), np.array(poses), np.array(privileged)

@@ -146,7 +146,8 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 NEAR, SLIDING, PROGRESS, UNCERTAINTY = 5.0 * MM, 1.0 * MM, 1.0 * MM, 2.0 * MM
 DELAYS = (0.2, 0.6)
 COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale as in the other observations [N]
-LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
+FORCES = (0, 1, 2, 5)  # entries of the wrench in "shared"; torques across the axis are those of the center of pressure
+SOCKET_OFFSET, LAG = slice(11, 13), slice(16, 18)  # indices into "shared", both across the axis
 
 
 class PartUncertainty(BncUncertainty):
@@ -204,17 +205,17 @@ class ScriptedSearch:
         if passed <= 0.0:
             self._action, self._direction, passed = np.zeros(self._size), 1.0, 0.0
         self._time = time
-        lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
-        if len(observation) >= LAG.stop:  # "shared"
-            lever = lever * self._file.search.lever_sign
+        if len(observation) >= SHARED_SIZE:
+            towards = observation[SOCKET_OFFSET] * COMMAND_SCALE
             distance = observation[LAG] * (SLIDING + self._file.clearance) / COMMAND_SCALE
         else:
+            towards = self._file.search.lever_sign * observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
             distance = observation[POSITION] - observation[COMMAND]
-        height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
+        height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(towards))
         on_rim, search = height > self._file.motion.first_contact - IN_SOCKET, self._file.search
         change = np.zeros(self._size)
         if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
-            change[:2] = search.lever_sign * search.speed * lever / max(length, MM)
+            change[:2] = search.speed * towards / max(length, MM)
             if abs(self._action[-1]) >= 1.0:
                 self._direction = -np.sign(self._action[-1])
             change[2:] = self._direction * search.turn_speed
@@ -228,10 +229,11 @@ class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
-    a policy of many parts: "center_of_pressure" with forces relative to the force limit, lateral positions relative to
-    the reach of an action, and the lever arm with the part's measured sign; then the height above the measured first
-    contact, the distance of the plug from the command (laterally relative to the clearance), the plug's progress in
-    the last 0.2 and 0.6 s, which shows whether anything moves, and the socket's axis as estimated by `SocketEstimator`.
+    a policy of many parts: forces relative to the force limit, and lateral positions relative to the reach of an
+    action. In place of the center of pressure, whose direction depends on the part, it has the socket's axis as
+    `SocketEstimator` estimates it, and the covariance of this estimate. Further entries are the height above the
+    measured first contact, the distance of the plug from the command (laterally relative to the clearance), and the
+    plug's progress in the last 0.2 and 0.6 s, which shows whether anything moves.
     """
 
     workpiece, fixture = PLUG, SOCKET
@@ -373,17 +375,17 @@ class PartInsertion(DemonstratedInsertion):
             return self.observed(center, scale, WRENCH_SCALE)
         half, reach, file = 0.5 * self.duration, self._reach, self.file
         scale[:2] = reach
-        lag = np.array([*[SLIDING + file.clearance] * 2, NEAR])
+        lag, forces = np.array([*[SLIDING + file.clearance] * 2, NEAR]), WRENCH_SCALE[list(FORCES)]
         terms = (
             ObservationTerm("time", half, half),
             ObservationTerm("pose", center, scale),
-            ObservationTerm("wrench", 0.0, WRENCH_SCALE * self.largest_force_limit / COMMON_FORCE_LIMIT),
-            ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE * file.search.lever_sign),
+            ObservationTerm("wrench", 0.0, forces * self.largest_force_limit / COMMON_FORCE_LIMIT, FORCES),
+            ObservationTerm("socket_offset", 0.0, reach, (0, 1)),
             ObservationTerm("desired_pose", 0.0, reach, (0, 1)),
             ObservationTerm("pose", file.motion.first_contact, NEAR, (2,)),
             ObservationTerm("lag", 0.0, lag),
             ObservationTerm("progress", 0.0, PROGRESS),
-            ObservationTerm("socket_offset", 0.0, np.array([reach, reach, *[UNCERTAINTY**2] * 3])),
+            ObservationTerm("socket_offset", 0.0, UNCERTAINTY**2, (2, 3, 4)),
             *self.force_limit_terms(),
         )
         return Observed(terms, privileged=PRIVILEGED)
@@ -454,7 +456,9 @@ class PartInsertion(DemonstratedInsertion):
         selected = [index for index, name in enumerate(SYMMETRIES) if name in names]
         if not selected or self.has_image:
             return None
-        symmetries = sides_of_the_rim(self.observation, _shared_sides if self.observation == "shared" else _no_sides)
+        symmetries = sides_of_the_rim("state" if self.observation == "shared" else self.observation)
+        if self.observation == "shared":
+            symmetries = (np.array([_shared_side(pose) for pose in symmetries[1]]), *symmetries[1:])
         return Symmetry(*(matrices[selected] for matrices in symmetries)).pad(len(self.force_limit_terms()))
 
     def scene(self) -> Scene:
@@ -476,17 +480,18 @@ class PartInsertion(DemonstratedInsertion):
         )
 
 
-def _no_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return no matrices, for observations without further entries."""
-    return ()
-
-
-def _shared_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the matrices of the last entries of "shared" for a rotation or reflection across the axis (2, 2)."""
+def _shared_side(pose: np.ndarray) -> np.ndarray:
+    """Return the matrix of the observation "shared" for the symmetry whose matrix of poses is `pose` (6, 6)."""
+    across = pose[:2, :2]
     moved = block_diag(across, np.eye(1))
     (a, b), (c, d) = across
     covariance = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]])
-    return (np.eye(1), *[moved] * (1 + len(DELAYS)), across, covariance)
+    force = block_diag(across, np.eye(2))
+    progress = [moved] * len(DELAYS)
+    return np.asarray(block_diag(np.eye(1), pose, force, across, across, np.eye(1), moved, *progress, covariance))
+
+
+SHARED_SIZE = len(_shared_side(np.eye(POSE_SIZE)))
 
 
 RIM_OFFSET = 1.5 * MM  # displacement at which a plug is pressed on the rim [m]
