@@ -165,7 +165,9 @@ class PartUncertainty(BncUncertainty):
 
 
 class ScriptedSearch:
-    """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
+    """Search by contact: while the plug is blocked, the action moves steadily towards the socket's axis.
+
+    The center of pressure indicates the direction, in the observation "shared" the estimated socket.
 
     A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows the plug's lateral
     position, so that the plug is not pushed against a wall. If the task has a `search_turn`, a third entry of the
