@@ -2,11 +2,12 @@
 
 The parts are split by a rule before anything is trained (`split_parts`), and the split is written to `split.json`.
 Then the parts are prepared, a policy is trained over the training parts with each seed, and all policies are evaluated
-on the held-out parts: uniform random actions, the scripted search, policies of single training parts, specialists of
-the held-out parts, the general policy of each seed, and the mean of their actions. The general policies are also
-evaluated under the uncertainty that AutoMate states, and in MuJoCo. `--few-shot` compares specialists that learn from
-scratch with those that the general policy demonstrates to. Every finished step is stored, and the same command resumes.
-`rows/` has the episodes of each policy on each part, `table.md` the successes.
+on the held-out parts: uniform random actions, the scripted search (with the contact map, and by the center of pressure
+alone), policies of single training parts, specialists of the held-out parts, the general policy of each seed, and the
+mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, and in
+MuJoCo. `--few-shot` compares specialists that learn from scratch with those that the general policy demonstrates to.
+Every finished step is stored, and the same command resumes. `rows/` has the episodes of each policy on each part,
+`table.md` the successes.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from scipy.stats import wilcoxon
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
@@ -38,6 +40,7 @@ CONDITIONS = {
     "hard": ENVIRONMENT,
     "automate": ENVIRONMENT | {"difficulty": "automate"},
     "mujoco": ENVIRONMENT | {"station": "mujoco"},
+    "center_of_pressure": ENVIRONMENT | {"observation": "center_of_pressure"},  # for a search without a contact map
 }
 FEW_SHOT = (10, 20, 40, 80)  # training episodes after which a specialist is evaluated
 DEMONSTRATED = {"demonstration_episodes": 5, "demonstration_fraction": 0.5, "exploration.constant_episodes": 0}
@@ -125,15 +128,18 @@ def tabulate(rows: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
         limits["collisions"] += int((episodes["termination"] == "collision").sum())
         limits["violation"] = max(limits["violation"], float(episodes["max_commanded_violation"].max()))
     table = pd.DataFrame(rates)
-    easy = (table.get("uniform_random", 0.0) > EASY_RANDOM) | (table.get("scripted", 0.0) > EASY_SEARCH)
-    table["shows_learning"] = ~easy
+    searched = table.get("scripted", pd.Series(0.0, table.index))
+    table["shows_learning"] = ~((table.get("uniform_random", 0.0) > EASY_RANDOM) | (searched > EASY_SEARCH))
     summary: dict[str, Any] = {}
     for name in rates:
         column = table[name].dropna()
+        gained = (column - searched)[searched < EASY_SEARCH].dropna()
         summary[name] = {
             "parts": len(column), "mean": round(float(column.mean()), 4), "worst": float(column.min()),
             "parts_from_90_percent": int((column >= 0.9).sum()),
-            "mean_where_learning_shows": round(float(column[table["shows_learning"]].mean()), 4), **worst[name],
+            "mean_where_learning_shows": round(float(column[table["shows_learning"]].mean()), 4),
+            "p_better_than_search": wilcoxon(gained, alternative="greater").pvalue if gained.any() else None,
+            **worst[name],
         }  # fmt: skip
     return table, summary
 
@@ -196,6 +202,8 @@ def main(arguments: list[str]) -> None:
     for part in held_out:
         evaluate_part(part, policies, args.evaluated, out)
     general = {name: run for name, run in policies.items() if name.startswith("general-")}
+    for part in held_out:
+        evaluate_part(part, {"scripted": "scripted"}, args.evaluated, out, "center_of_pressure")
     for condition in ("automate", "mujoco"):
         for part in held_out:
             evaluate_part(part, general, args.evaluated, out, condition)
