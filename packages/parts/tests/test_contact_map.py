@@ -9,7 +9,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail_parts.contact_map import RADIUS, ContactMap, SocketEstimator, histogram_positions
+from guiderail_parts.contact_map import RADIUS, ContactMap
+from guiderail_parts.socket_estimator import SocketEstimator, histogram_positions
 
 PERIOD = 0.02
 SOCKET = np.array([2.0, -1.5]) * MM

@@ -1,10 +1,8 @@
-"""Contact map of two parts, and the socket's position that a plug on the rim estimates with it.
+"""Contact map of two parts: where a misaligned plug touches the socket, by its position.
 
-Where a misaligned plug touches a socket depends on the shapes of both, so that the direction from the center of
-pressure to the socket's axis differs from part to part. The map is measured in simulation, before any episode:
-`create-task` presses the plug on the rim at random positions. In an episode, a histogram filter compares the centers of
-pressure with the map, as in Chhatpar and Branicky, "Particle filtering for localization in robotic assemblies with
-position uncertainty" (IROS 2005).
+It depends on the shapes of both parts, so that the direction from the center of pressure to the socket's axis differs
+from part to part. `create-task` measures the map in simulation: it presses the plug on the rim at random positions.
+`SocketEstimator` compares the centers of pressure of an episode with the map.
 """
 
 from __future__ import annotations
@@ -15,41 +13,28 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
-from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes, write_atomically
-from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.primitives.kernels import SquaredExponential
-from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail_parts.task_file import IN_SOCKET, MotionNumbers
 
-RADIUS = 4.25 * MM  # largest distance of the socket from its nominal position in the filter [m]
-SPACING = 0.25 * MM  # distance of the filter's positions and of the map's table [m]
+RADIUS = 4.25 * MM  # largest distance of the socket from its nominal position [m]
+SPACING = 0.25 * MM  # distance of the positions in the map's table [m]
 EXTENT = 7.0 * MM  # largest |x| and |y| of the plug relative to the socket in the map's table [m]
 LENGTH_SCALE, NOISE = 0.7 * MM, 0.05  # of the regression [m]; variance of a sample relative to that of the map
 NEAR = 0.4 * MM  # distance over which the variance of samples is averaged [m]
 WEAK = 0.05  # number of samples that the variance of all centers of pressure counts as
 MIN_DEVIATION = 0.2 * MM  # smallest standard deviation of a center of pressure from the map [m]
-RATE = 0.25  # weight of one sample: consecutive samples are not independent
 OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to the largest likelihood
 COLUMNS = ("x", "y", "center_x", "center_y", "on_rim")  # of the file [mm], the last is 1 or 0
 MAX_FILE_SIZE = 1 << 20  # [bytes]
 MAX_SAMPLES = 600  # largest number of samples that a regression uses
-FORGETTING = 0.995  # factor of the log-probabilities per sample, so that wrong early samples are forgotten
-
-
-def histogram_positions() -> np.ndarray:
-    """Return the positions of the socket relative to its nominal position that the filter distinguishes, (H, 2) [m]."""
-    ticks = SPACING * np.arange(-round(RADIUS / SPACING), round(RADIUS / SPACING) + 1)
-    positions = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
-    return positions[np.hypot(*positions.T) <= RADIUS]
 
 
 @dataclass(frozen=True)
@@ -140,70 +125,6 @@ class ContactMap:
         mean, variance, rim = table[i, j, :2], table[i, j, 2], table[i, j, 3]
         likelihood = rim * np.exp(-0.5 * ((mean - center) ** 2).sum(axis=1) / variance) / variance
         return np.asarray(np.log(likelihood + OUTLIERS / table[:, :, 2].max()))
-
-
-class SocketEstimator(LeafSystem):
-    """Estimate the socket's axis relative to the plug with a histogram filter.
-
-        log P(s) ← γ log P(s) + r log p(c | p − s)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
-        socket_offset = (m − p, C_xx, C_xy, C_yy),  m = Σ P(s) s,  C = Σ P(s) (s − m) (s − m)ᵀ
-
-    s is a position of the socket (`histogram_positions`), p that of the plug in x and y, and c the center of pressure.
-    A plug that stays on the rim excludes the positions at which it would enter. All positions within `RADIUS` of the
-    nominal one are initially equally likely.
-
-    ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
-    finite are skipped. ``socket_offset`` is (5,) [m, m²]. A sample affects the output from the next control
-    step.
-
-    Args:
-        contact_map: Map of the parts; None leaves all positions equally likely.
-        min_force: Force along z below which a sample is not used [N].
-        lowest: Height of the plug below which it is in the socket, and a sample is not used [m].
-        period: Control period [s], positive.
-    """
-
-    def __init__(self, contact_map: ContactMap | None, *, min_force: float, lowest: float, period: float):
-        super().__init__()
-        self._map, self._min_force, self._lowest = contact_map, min_force, lowest
-        self._positions = histogram_positions()
-        self._state = self.DeclareDiscreteState(len(self._positions))  # log-probabilities, up to a constant
-        self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
-        self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
-        self._estimate = declare.cache(self, "estimate", self._calc_estimate, [self._state])
-        declare.output(self, "socket_offset", 5, self._socket_offset, [self._pose_port, self._state])
-        declare.update(self, period, self._update, declare.reset_to_default(self))
-
-    get_pose_input_port = input_getter("pose", "pose of the plug, (6,)")
-    get_wrench_input_port = input_getter("wrench", "wrench about the tool center, (6,) [N, Nm]")
-    get_socket_offset_output_port = output_getter("socket_offset", "x, y and covariances xx, xy, yy, (5,) [m, m²]")
-
-    def _log_probabilities(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state().value(self._state)
-
-    def _calc_estimate(self, context: Context) -> np.ndarray:
-        log_probabilities = self._log_probabilities(context)
-        weights = np.exp(log_probabilities - log_probabilities.max())
-        weights /= weights.sum()
-        mean = weights @ self._positions
-        distance = self._positions - mean
-        covariance = distance.T @ (weights[:, None] * distance)
-        return np.array([*mean, covariance[0, 0], covariance[0, 1], covariance[1, 1]])
-
-    def _socket_offset(self, context: Context) -> np.ndarray:
-        offset = self._estimate.Eval(context).copy()
-        offset[:2] -= self._pose_port.Eval(context)[:2]
-        return offset
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        pose, wrench = self._pose_port.Eval(context), self._wrench_port.Eval(context)
-        if self._map is None or not (is_finite(pose) and is_finite(wrench)):
-            return
-        if wrench[2] < self._min_force or pose[2] < self._lowest:
-            return
-        center = center_of_pressure(wrench, self._min_force)
-        change = RATE * self._map.log_likelihood(pose[:2], center, self._positions)
-        discrete_state.set_value(self._state, FORGETTING * self._log_probabilities(context) + change)
 
 
 # Motion that measures a map: the plug touches the rim at random places and slides on it.

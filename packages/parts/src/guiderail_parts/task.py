@@ -50,10 +50,11 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.movement_primitive import HistoryBuffer
 from guiderail.tools.learning.learner_config import resolve_preset
-from guiderail_parts.contact_map import ContactMap, SocketEstimator
+from guiderail_parts.contact_map import ContactMap
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
 from guiderail_parts.geometry.obj_file import read_obj
+from guiderail_parts.socket_estimator import SocketEstimator
 from guiderail_parts.task_file import (
     AUTOMATE,
     FILE_NAME,
