@@ -665,43 +665,57 @@ def test_shared_observation_is_relative_to_the_measured_contact(folder):
             break
     observations, poses, commands = map(np.array, (observations, poses, commands))
     height = np.clip((poses[:, 2] - file.motion.first_contact) / 5e-3, -3, 3)
-    np.testing.assert_allclose(observations[:, 17], height, atol=1e-5)
+    np.testing.assert_allclose(observations[:, 15], height, atol=1e-5)
     lag = np.clip((poses - commands)[:, 2] / 5e-3, -3, 3)
-    assert np.corrcoef(observations[:, 20], lag)[0, 1] > 0.99
+    assert np.corrcoef(observations[:, 18], lag)[0, 1] > 0.99
     per_action = env.action_repeat * env.diagram.control_period
-    for delay, entries in ((0.2, slice(21, 24)), (0.6, slice(24, 27))):
+    for delay, entries in ((0.2, slice(19, 22)), (0.6, slice(22, 25))):
         back = round(delay / per_action)
         moved = np.clip((poses[back:] - poses[:-back])[:, :3] / 1e-3, -3, 3)
         np.testing.assert_allclose(observations[back:, entries], moved, atol=1e-4)
     env.close()
 
 
-def test_search_acts_equally_on_the_shared_observation(folder):
-    actions = {}
-    for name in ("center_of_pressure", "shared"):
-        env = shared(folder, observation=name)
-        search = find_scripted_policy(env.diagram.task.name, "scripted_search")
-        observation, _ = env.reset(seed=1)
-        actions[name] = []
-        while True:
-            actions[name].append(search(observation))
-            observation, _, terminated, truncated, _ = env.step(actions[name][-1])
-            if terminated or truncated:
-                break
-        env.close()
-    first, second = (np.array(each) for each in actions.values())
-    assert len(first) == len(second)
-    np.testing.assert_allclose(first, second, atol=1e-3)
+def test_search_inserts_with_the_estimated_socket(folder):
+    assert read_task_file(folder).search.contact_map == "contact_map.csv"
+    env = shared(folder)
+    search = find_scripted_policy(env.diagram.task.name, "scripted_search")
+    observation, _ = env.reset(seed=1)
+    assert observation[25] == pytest.approx(observation[27], abs=1e-5)  # equally uncertain along x and y
+    uncertainty, done = observation[25], False
+    while not done:
+        observation, _, terminated, truncated, info = env.step(search(observation))
+        done = terminated or truncated
+    assert info["is_success"]
+    assert np.abs(observation[11:13]).max() < 0.2  # the plug is where the socket was estimated
+    assert max(observation[25], observation[27]) < 0.1 * uncertainty
+    env.close()
+
+
+def test_without_a_contact_map_the_socket_stays_uncertain(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "no_map")
+    file = tmp_path / "no_map/task.yaml"
+    file.write_text(
+        re.sub(r"contact_map: \S+?([,}])", r"contact_map: null\1", file.read_text()).replace("/peg", "/no_map")
+    )
+    env = shared(tmp_path / "no_map")
+    first, _ = env.reset(seed=1)
+    for _ in range(20):
+        observation, *_ = env.step(np.zeros(2))
+    np.testing.assert_allclose(observation[25:28], first[25:28])
+    env.close()
 
 
 def test_shared_observation_has_the_symmetries_of_the_part(folder):
     env, other = shared(folder), shared(folder, observation="center_of_pressure")
-    symmetry, known = env.diagram.near_symmetry, other.diagram.near_symmetry
-    np.testing.assert_array_equal(symmetry.observations[:, :17, :17], known.observations)
-    across = symmetry.observations[0][15:17, 15:17]  # commanded x and y
-    np.testing.assert_array_equal(symmetry.observations[0][18:20, 18:20], across)
-    for start in (21, 24):
-        np.testing.assert_array_equal(symmetry.observations[0][start : start + 2, start : start + 2], across)
-    assert (symmetry.observations[:, [17, 20, 23, 26], [17, 20, 23, 26]] == 1).all()
+    symmetry, known = env.diagram.near_symmetry.observations, other.diagram.near_symmetry.observations
+    np.testing.assert_array_equal(symmetry[:, :10, :10], known[:, :10, :10])  # time, pose and force
+    for matrix, by_center in zip(symmetry, known, strict=True):
+        across = by_center[13:15, 13:15]
+        for start in (11, 13, 16, 19, 22):  # estimate, command, distance from the command, progress
+            np.testing.assert_array_equal(matrix[start : start + 2, start : start + 2], across)
+        assert (np.diag(matrix)[[10, 15, 18, 21, 24]] == 1).all()
+        xx, xy, yy = matrix[25:28, 25:28] @ [3.0, 0.5, 1.0]
+        np.testing.assert_allclose([[xx, xy], [xy, yy]], across @ [[3.0, 0.5], [0.5, 1.0]] @ across.T)
     env.close()
     other.close()
