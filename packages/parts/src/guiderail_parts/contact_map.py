@@ -1,8 +1,9 @@
-"""Contact map of two parts: where a misaligned plug touches the socket, by its position.
+"""Contact map of two parts: where a misaligned plug touches the socket, by its position and tilt.
 
 It depends on the shapes of both parts, so that the direction from the center of pressure to the socket's axis differs
-from part to part. `create-task` measures the map in simulation: it presses the plug on the rim at random positions.
-`SocketEstimator` compares the centers of pressure of an episode with the map.
+from part to part. It also depends on the tilt of the plug, which moves the center of pressure to an edge. `create-task`
+measures the map in simulation: it presses the plug on the rim at random positions and tilts. `SocketEstimator` compares
+the centers of pressure of an episode with the map.
 """
 
 from __future__ import annotations
@@ -24,44 +25,40 @@ from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.primitives.kernels import SquaredExponential
 from guiderail_parts.task_file import IN_SOCKET, MotionNumbers
 
-RADIUS = 4.25 * MM  # largest distance of the socket from its nominal position [m]
-SPACING = 0.25 * MM  # distance of the positions in the map's table [m]
-EXTENT = 7.0 * MM  # largest |x| and |y| of the plug relative to the socket in the map's table [m]
-LENGTH_SCALE, NOISE = 0.7 * MM, 0.05  # of the regression [m]; variance of a sample relative to that of the map
-NEAR = 0.4 * MM  # distance over which the variance of samples is averaged [m]
+# Length scales of the regression, of positions [m] and tilts [rad], and variance of a sample relative to the map's.
+POSITION_SCALE, TILT_SCALE, NOISE = 1.5 * MM, 0.010, 0.05
 WEAK = 0.05  # number of samples that the variance of all centers of pressure counts as
-MIN_DEVIATION = 0.2 * MM  # smallest standard deviation of a center of pressure from the map [m]
-OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to the largest likelihood
-COLUMNS = ("x", "y", "center_x", "center_y", "on_rim")  # of the file [mm], the last is 1 or 0
-MAX_FILE_SIZE = 1 << 20  # [bytes]
+MIN_DEVIATION = 0.3 * MM  # smallest standard deviation of a center of pressure from the map [m]
+OUTLIERS = 0.02  # likelihood of a sample that contradicts the map, relative to that of its variance
 MAX_SAMPLES = 600  # largest number of samples that a regression uses
+COLUMNS = ("x", "y", "tilt_y", "tilt_x", "center_x", "center_y")  # of the file [mm], [degrees]
+UNITS = np.array([MM, MM, DEGREE, DEGREE, MM, MM])
+MAX_FILE_SIZE = 1 << 20  # [bytes]
 
 
 @dataclass(frozen=True)
 class ContactMap:
-    """Samples of a pressed plug, by its position relative to the socket: on the rim or not, and center of pressure.
+    """Centers of pressure of a plug on the rim, by its position relative to the socket and its tilt.
 
     Args:
         positions: Positions of the plug relative to the socket, x and y, (N, 2) [m].
-        centers: Center of pressure at each position, relative to the tool center, (N, 2) [m]; unused in the socket.
-        on_rim: True where the plug is on the rim, False where it has entered the socket, (N,).
+        tilts: Tilts Ry and Rx of the plug, (N, 2) [rad].
+        centers: Center of pressure of each sample, relative to the tool center, (N, 2) [m].
 
     Raises:
-        InputError: If the arrays are not finite or not of these shapes, or no plug is on the rim.
+        InputError: If the arrays are not finite or not of these shapes.
     """
 
     positions: np.ndarray
+    tilts: np.ndarray
     centers: np.ndarray
-    on_rim: np.ndarray
 
     def __post_init__(self) -> None:
         shape = self.positions.shape
-        if len(shape) != 2 or shape[1] != 2 or self.centers.shape != shape or self.on_rim.shape != shape[:1]:
-            raise InputError("a contact map has as many positions (N, 2) as centers of pressure (N, 2) and flags (N,)")
-        if not (np.isfinite(self.positions).all() and np.isfinite(self.centers).all()):
+        if len(shape) != 2 or not shape[0] or shape[1] != 2 or not shape == self.tilts.shape == self.centers.shape:
+            raise InputError("a contact map has as many positions, tilts and centers of pressure, each (N, 2)")
+        if not all(np.isfinite(samples).all() for samples in (self.positions, self.tilts, self.centers)):
             raise InputError("a contact map has values that are not finite")
-        if not self.on_rim.any():
-            raise InputError("a contact map has samples on the rim")
 
     @classmethod
     def load(cls, path: Path) -> ContactMap:
@@ -78,68 +75,72 @@ class ContactMap:
             rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         except ValueError as error:
             raise InputError(f"{path} is not a contact map ({brief(error)}): create the task again") from error
-        return cls(MM * rows[:, :2], MM * rows[:, 2:4], rows[:, 4] != 0.0)
+        if rows.shape[1:] != UNITS.shape:
+            raise InputError(f"{path} is not a contact map: its columns are {','.join(COLUMNS)}")
+        rows = rows * UNITS
+        return cls(rows[:, :2], rows[:, 2:4], rows[:, 4:])
 
     def save(self, path: Path) -> None:
-        """Write the samples as a table, in millimeters."""
+        """Write the samples as a table, in millimeters and degrees."""
         text = StringIO()
-        rows = np.column_stack([self.positions / MM, self.centers / MM, self.on_rim])
-        np.savetxt(text, rows, fmt=["%.4f"] * 4 + ["%d"], delimiter=",", header=",".join(COLUMNS), comments="")
+        rows = np.hstack([self.positions, self.tilts, self.centers]) / UNITS
+        np.savetxt(text, rows, fmt="%.4f", delimiter=",", header=",".join(COLUMNS), comments="")
         write_atomically(path, text.getvalue().encode())
 
     @cached_property
-    def _table(self) -> np.ndarray:
-        """Mean (2) and variance of the center of pressure, and probability of the rim, on a grid, (M, M, 4) [m, m²]."""
-        every = -(-int(self.on_rim.sum()) // MAX_SAMPLES)
-        positions, centers = (samples[self.on_rim][::every] for samples in (self.positions, self.centers))
-        kernel, mean = SquaredExponential(LENGTH_SCALE), centers.mean(axis=0)
-        K = kernel(positions, positions) + NOISE * np.eye(len(positions))
-        weights = np.linalg.solve(K, centers - mean)
-        errors = ((centers - mean - kernel(positions, positions) @ weights) ** 2).mean(axis=1)
-        ticks = SPACING * np.arange(-round(EXTENT / SPACING), round(EXTENT / SPACING) + 1)
-        grid = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
-        predicted = mean + kernel(grid, positions) @ weights
-        # Without a sample nearby, the variance is that of all centers of pressure.
-        near, whole = SquaredExponential(NEAR)(grid, positions), centers.var(axis=0).mean()
-        variance = (near @ errors + WEAK * whole) / (near.sum(axis=1) + WEAK) + MIN_DEVIATION**2
-        # The plug stays on the rim where nothing was measured.
-        every_near = SquaredExponential(NEAR)(grid, self.positions)
-        rim = (every_near @ self.on_rim + WEAK) / (every_near.sum(axis=1) + WEAK)
-        return np.column_stack([predicted, variance, rim]).reshape(len(ticks), len(ticks), 4)
+    def _regression(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Positions, tilts and centers of the used samples, their weights (N, 2), and variance of all centers [m²]."""
+        every = -(-len(self.positions) // MAX_SAMPLES)
+        positions, tilts, centers = (samples[::every] for samples in (self.positions, self.tilts, self.centers))
+        by_tilt, by_position = SquaredExponential(TILT_SCALE), SquaredExponential(POSITION_SCALE)
+        K = by_position(positions, positions) * by_tilt(tilts, tilts) + NOISE * np.eye(len(positions))
+        inverse = np.linalg.inv(K)
+        weights = inverse @ (centers - centers.mean(axis=0))
+        # Squared error of each sample if it is left out (Rasmussen and Williams, equation 5.12)
+        errors = ((weights / np.diag(inverse)[:, None]) ** 2).mean(axis=1)
+        terms = np.column_stack([weights, errors, np.ones(len(errors))])
+        return positions, tilts, centers, terms, float(centers.var(axis=0).mean())
 
-    def log_likelihood(self, plug: np.ndarray, center: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of a sample of a plug on the rim, for each position of the socket.
-
-        A position is unlikely if the center of pressure would be another one, or the plug would enter.
+    def log_likelihood(self, plug: np.ndarray, tilt: np.ndarray, center: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of a center of pressure for each position of the socket on a square grid.
 
         Args:
             plug: Position of the plug, x and y, (2,) [m].
+            tilt: Its tilts Ry and Rx, (2,) [rad].
             center: Its center of pressure, (2,) [m].
-            positions: Positions of the socket, (H, 2) [m].
+            ticks: Coordinates of the socket, the same along x and y, (M,) [m].
 
         Returns:
-            Log-likelihoods (H,), up to a constant.
+            Log-likelihoods (M, M), up to a constant.
         """
-        table = self._table
-        i, j = np.clip(np.rint((plug - positions + EXTENT) / SPACING).astype(int), 0, len(table) - 1).T
-        mean, variance, rim = table[i, j, :2], table[i, j, 2], table[i, j, 3]
-        likelihood = rim * np.exp(-0.5 * ((mean - center) ** 2).sum(axis=1) / variance) / variance
-        return np.asarray(np.log(likelihood + OUTLIERS / table[:, :, 2].max()))
+        positions, tilts, centers, terms, whole = self._regression
+        kernel = SquaredExponential(POSITION_SCALE)
+        # The kernel is a product over x, y and tilt.
+        along_x, along_y = (kernel(plug[axis] - ticks, positions[:, axis]) for axis in (0, 1))
+        terms = terms * SquaredExponential(TILT_SCALE)(tilt[None], tilts).T
+        sums = np.einsum("in,njk->ijk", along_x, along_y.T[:, :, None] * terms[:, None, :], optimize=True)
+        difference = centers.mean(axis=0) + sums[:, :, :2] - center
+        # Far from all samples, the variance is that of all centers of pressure.
+        variance = (sums[:, :, 2] + WEAK * whole) / (sums[:, :, 3] + WEAK) + MIN_DEVIATION**2
+        likelihood = np.exp(-0.5 * (difference**2).sum(axis=2) / variance) / variance
+        return np.asarray(np.log(likelihood + OUTLIERS / (whole + MIN_DEVIATION**2)))
 
 
 # Motion that measures a map: the plug touches the rim at random places and slides on it.
-TOUCHES = 40
+TOUCHES = 60
+RADIUS = 5.0 * MM  # largest distance of the plug from the socket's axis [m]
 HEIGHT = 1.0 * MM  # height above the first contact between two touches [m]
-DESCENT, SLIDE, LIFT, TRAVERSE = 0.3, 0.4, 0.15, 0.2  # durations [s]
+TRAVERSE, DESCENT, SLIDE, LIFT = 0.3, 0.2, 0.5, 0.15  # durations [s]
 MAX_SLIDE = 3.0 * MM  # largest length of a slide [m]
-TURN = 2.0 * DEGREE  # largest turn of the plug [rad]
+MIN_PRESS = 0.4  # smallest depth of the command, relative to that of a search
+TURN, TILT = 2.0 * DEGREE, 0.7 * DEGREE  # largest turn and standard deviation of the tilts of the command [rad]
 
 
 def plan_touches(motion: MotionNumbers, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and poses (N, 6) [m, rad] of `TOUCHES` touches of the rim."""
     rng = np.random.default_rng(seed)
     turn = float(motion.plan_search()[1][0, 3])
-    high, low = motion.first_contact + HEIGHT, motion.first_contact - motion.press
+    high = motion.first_contact + HEIGHT
     durations, poses = [0.0], [np.array([0.0, 0.0, high, turn, 0.0, 0.0])]
 
     def draw() -> np.ndarray:
@@ -149,9 +150,13 @@ def plan_touches(motion: MotionNumbers, seed: int = 0) -> tuple[np.ndarray, np.n
     for _ in range(TOUCHES):
         start, end, yaw = draw(), draw(), turn + rng.uniform(-TURN, TURN)
         end = start + (end - start) * min(1.0, MAX_SLIDE / max(float(np.linalg.norm(end - start)), 1e-9))
-        for duration, xy, z in ((TRAVERSE, start, high), (DESCENT, start, low), (SLIDE, end, low), (LIFT, end, high)):
+        first, last = rng.normal(0.0, TILT, (2, 2))
+        low = motion.first_contact - rng.uniform(MIN_PRESS, 1.0) * motion.press
+        above, below = (start, high, first), (end, low, last)
+        steps = ((TRAVERSE, above), (DESCENT, (start, low, first)), (SLIDE, below), (LIFT, (end, high, last)))
+        for duration, (xy, z, tilt) in steps:
             durations.append(duration)
-            poses.append(np.array([*xy, z, yaw, 0.0, 0.0]))
+            poses.append(np.array([*xy, z, yaw, *tilt]))
     return np.cumsum(durations), np.array(poses)
 
 
@@ -162,9 +167,8 @@ def measure_contact_map(station: Station, motion: MotionNumbers) -> ContactMap |
     """
     _, recording = drive_along(station, *plan_touches(motion))
     wrench, pose = recording["wrench"], recording["pose"]
-    on_rim = pose[:, 2] >= motion.first_contact - IN_SOCKET
-    used = ~on_rim | (wrench[:, 2] >= MIN_CONTACT_FORCE)
-    if not (on_rim & used).any():
+    on_rim = (wrench[:, 2] >= MIN_CONTACT_FORCE) & (pose[:, 2] >= motion.first_contact - IN_SOCKET)
+    if not on_rim.any():
         return None
-    centers = np.array([center_of_pressure(sample, MIN_CONTACT_FORCE) for sample in wrench[used]])
-    return ContactMap(pose[used, :2], centers, on_rim[used])
+    centers = np.array([center_of_pressure(sample, MIN_CONTACT_FORCE) for sample in wrench[on_rim]])
+    return ContactMap(pose[on_rim, :2], pose[on_rim, 4:], centers)

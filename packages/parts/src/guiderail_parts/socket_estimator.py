@@ -10,32 +10,29 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import is_finite
-from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.common.transforms import MM, POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail_parts.contact_map import RADIUS, SPACING, ContactMap
+from guiderail_parts.contact_map import ContactMap
 
-RATE = 0.25  # weight r of one sample: consecutive samples are not independent
-FORGETTING = 0.995  # factor γ of the log-probabilities per sample, so that wrong early samples are forgotten
-
-
-def histogram_positions() -> np.ndarray:
-    """Return the positions of the socket relative to its nominal position that the filter distinguishes, (H, 2) [m]."""
-    ticks = SPACING * np.arange(-round(RADIUS / SPACING), round(RADIUS / SPACING) + 1)
-    positions = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
-    return positions[np.hypot(*positions.T) <= RADIUS]
+RADIUS, SPACING = 4.25 * MM, 0.25 * MM  # of the positions of the socket that the filter distinguishes [m]
+TICKS = SPACING * np.arange(-round(RADIUS / SPACING), round(RADIUS / SPACING) + 1)
+_GRID = np.stack(np.meshgrid(TICKS, TICKS, indexing="ij"), axis=-1)
+_INSIDE = np.hypot(_GRID[:, :, 0], _GRID[:, :, 1]) <= RADIUS
+POSITIONS = _GRID[_INSIDE]  # positions of the socket relative to its nominal position, (H, 2) [m]
+RATE = 0.2  # weight r of one sample: consecutive samples are not independent
+FORGETTING = 0.99  # factor γ of the log-probabilities per sample, so that wrong early samples are forgotten
 
 
 class SocketEstimator(LeafSystem):
     """Estimate the socket's axis relative to the plug with a histogram filter.
 
-        log P(s) ← γ log P(s) + r log p(c | p − s)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
+        log P(s) ← γ log P(s) + r log p(c | p − s, a)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
         socket_offset = (m − p, C_xx, C_xy, C_yy),  m = Σ P(s) s,  C = Σ P(s) (s − m) (s − m)ᵀ
 
-    s is a position of the socket (`histogram_positions`), p that of the plug in x and y, and c the center of pressure.
-    A plug that stays on the rim excludes the positions at which it would enter. All positions within `RADIUS` of the
-    nominal one are initially equally likely.
+    s is a position of the socket, one of `POSITIONS`; p is that of the plug in x and y, a its tilt, and c the center of
+    pressure. All positions are initially equally likely.
 
     ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
     finite are skipped. ``socket_offset`` is (5,) [m, m²]. A sample affects the output from the next control
@@ -51,8 +48,7 @@ class SocketEstimator(LeafSystem):
     def __init__(self, contact_map: ContactMap | None, *, min_force: float, lowest: float, period: float):
         super().__init__()
         self._map, self._min_force, self._lowest = contact_map, min_force, lowest
-        self._positions = histogram_positions()
-        self._state = self.DeclareDiscreteState(len(self._positions))  # log-probabilities, up to a constant
+        self._state = self.DeclareDiscreteState(len(POSITIONS))  # log-probabilities, up to a constant
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         self._estimate = declare.cache(self, "estimate", self._calc_estimate, [self._state])
@@ -70,8 +66,8 @@ class SocketEstimator(LeafSystem):
         log_probabilities = self._log_probabilities(context)
         weights = np.exp(log_probabilities - log_probabilities.max())
         weights /= weights.sum()
-        mean = weights @ self._positions
-        distance = self._positions - mean
+        mean = weights @ POSITIONS
+        distance = POSITIONS - mean
         covariance = distance.T @ (weights[:, None] * distance)
         return np.array([*mean, covariance[0, 0], covariance[0, 1], covariance[1, 1]])
 
@@ -87,5 +83,5 @@ class SocketEstimator(LeafSystem):
         if wrench[2] < self._min_force or pose[2] < self._lowest:
             return
         center = center_of_pressure(wrench, self._min_force)
-        change = RATE * self._map.log_likelihood(pose[:2], center, self._positions)
+        change = RATE * self._map.log_likelihood(pose[:2], pose[4:], center, TICKS)[_INSIDE]
         discrete_state.set_value(self._state, FORGETTING * self._log_probabilities(context) + change)
