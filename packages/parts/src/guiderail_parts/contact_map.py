@@ -8,6 +8,7 @@ the centers of pressure of an episode with the map.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from io import StringIO
@@ -15,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes, write_atomically
@@ -128,6 +129,7 @@ class ContactMap:
 
 # Motion that measures a map: the plug touches the rim at random places and slides on it.
 TOUCHES = 60
+MAX_SECONDS = 15.0  # CPU time after which no further touches are simulated [s]
 RADIUS = 5.0 * MM  # largest distance of the plug from the socket's axis [m]
 HEIGHT = 1.0 * MM  # height above the first contact between two touches [m]
 TRAVERSE, DESCENT, SLIDE, LIFT = 0.3, 0.2, 0.5, 0.15  # durations [s]
@@ -163,9 +165,19 @@ def plan_touches(motion: MotionNumbers, seed: int = 0) -> tuple[np.ndarray, np.n
 def measure_contact_map(station: Station, motion: MotionNumbers) -> ContactMap | None:
     """Return the map of the parts of a station, whose socket is at its nominal position.
 
-    None if the plug never touched the rim. The station becomes part of a diagram.
+    None if the plug never touched the rim. The station becomes part of a diagram. After `MAX_SECONDS` of CPU time, the
+    measurement ends with the touches so far.
     """
-    _, recording = drive_along(station, *plan_touches(motion))
+    times, poses = plan_touches(motion)
+    touch = (len(times) - 1) // TOUCHES  # poses of a touch
+    driven = DrivenStation(station, linear_motion(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven.start(poses[0])
+    start = time.process_time()
+    for number in range(TOUCHES):
+        steps = np.diff(np.rint(times[[number * touch, (number + 1) * touch]] / CONTROL_PERIOD))
+        recording = driven.run(int(steps[0]))
+        if time.process_time() - start > MAX_SECONDS:
+            break
     wrench, pose = recording["wrench"], recording["pose"]
     on_rim = (wrench[:, 2] >= MIN_CONTACT_FORCE) & (pose[:, 2] >= motion.first_contact - IN_SOCKET)
     if not on_rim.any():
