@@ -1,4 +1,8 @@
-"""Bounds of an impedance's wrench: limits that change with a template, a reference governor, and an energy tank."""
+"""Bounds of an impedance's wrench: limits that change with a template, a reference governor, and an energy tank.
+
+`diagrams/stations/impedance_control.py` adds all three. packages/cpp has the first two in C++ (`force.hpp`), and its
+tests compare them.
+"""
 
 from contextlib import suppress
 from typing import NamedTuple

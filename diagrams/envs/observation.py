@@ -1,4 +1,8 @@
-"""Diagram of a policy's observation: concatenated signals, each centered, scaled and clipped."""
+"""Diagram of a policy's observation: concatenated signals, each centered, scaled and clipped.
+
+Tasks declare it in `Task.observe`, and `assemble.py` builds it. Order and scales are fixed by trained policies, by
+`Task.symmetries` and by scripted policies, which index the observation. packages/cpp exports them (`skill.py`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Option models of environments, guidance and resets: each option has a type, a range and a description."""
+"""Option models of environments, guidance and resets: each option has a type, a range and a description.
+
+`config.py` resolves them. `assemble.py` passes each guidance option to the argument of the same name, such as a field
+of `PrimitiveConfig`, unless its `_CONVERTED_OPTIONS` says otherwise.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Trace of an episode: commands, measurements and rewards of every control step, and their statistics."""
+"""Trace of an episode: commands, measurements and rewards of every control step, and their statistics.
+
+`DiagramEnv` fills it, and so does the executor of packages/hardware. A statistic becomes a column of results only if
+`COLUMNS` of tools/evaluation/metrics.py describes it.
+"""
 
 from __future__ import annotations
 

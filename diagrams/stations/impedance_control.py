@@ -1,4 +1,8 @@
-"""Impedance control of a station: by a Cartesian controller, or by joints with springs and dampers."""
+"""Impedance control of a station: by a Cartesian controller, or by joints with springs and dampers.
+
+The gantry, the arm, and the stations of packages/mujoco and packages/hardware use it. packages/cpp exports `MIN_MASS`
+and `MIN_INERTIA`, which must not exceed the masses of the gantry's carriage.
+"""
 
 from __future__ import annotations
 

@@ -209,7 +209,9 @@ class Station(Diagram):
     get_wrench_output_port = output_getter("wrench", "wrench of the surroundings on the tool, (W,)")
     get_contact_force_output_port = output_getter("contact_force", "magnitude of the contact force, (1,) [N]")
     get_impedance_force_output_port = output_getter("impedance_force", "magnitude of the impedance's force, (1,) [N]")
-    get_saturation_output_port = output_getter("saturation", "flag, 1 while the controller is at a limit, (1,)")
+    get_saturation_output_port = output_getter(
+        "saturation", "nonzero while the controller is at a limit, (1,); plane: (2,)"
+    )
     get_command_timed_out_output_port = output_getter(
         "command_timed_out", "flag, 1 while the last safe pose is held, (1,)"
     )

@@ -1,4 +1,8 @@
-"""Law of a shared control template (thesis, section 2.3)."""
+"""Law of a shared control template (thesis, section 2.3).
+
+The three systems of `systems/shared_control_template.py` call its parts with the frames of the moment, hence the
+argument `frames`. packages/cpp has the same law in C++ (`template.hpp`), and its tests compare them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""One window of an LC-NS-KMP: explicit features of the kernel, factored optimization problem, and predictions."""
+"""One window of an LC-NS-KMP: explicit features of the kernel, factored optimization problem, and predictions.
+
+`LcNsKmp` uses it. packages/cpp exports the maps of `StepFactor` (`arrays.py`) and solves with them (`primitive.hpp`).
+"""
 
 from dataclasses import dataclass
 

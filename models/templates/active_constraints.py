@@ -3,6 +3,8 @@
 Each projection is idempotent up to rounding: an allowed pose is not changed. The constraints of a state are applied in
 the order of the file. Therefore, constraints on the position must precede a constraint on the orientation that depends
 on the position.
+
+A new kind also needs its proof in `consistency.py`, and its export in packages/cpp (`templates.py`, `template.hpp`).
 """
 
 import math

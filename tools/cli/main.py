@@ -23,7 +23,7 @@ ENVIRONMENT_OPTIONS = (
     "--guidance", "--station", "--difficulty", "--reward", "--observation", "--action-repeat", "--fixture-offset",
     "--robot",
 )  # fmt: skip
-"""Options of `train` that other commands take as `--env NAME=VALUE`."""
+"""Options of `train` and of commands of packages/hardware that other commands take as `--env NAME=VALUE`."""
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 

@@ -48,7 +48,7 @@ def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
 
 
 STEPS, VIOLATION = "control steps", "m or rad"
-ENDINGS = "success, collision, spill, blocked, violation, time_limit or simulation_failure"
+ENDINGS = "success, collision, spill, blocked, violation, terminated, time_limit or simulation_failure"
 COLLISION = "contact force, or the task's own collision signal, above its limit"
 
 
@@ -68,7 +68,7 @@ COLUMNS = (
     Column("episode", "", "number of the episode, from 0"),
     Column("return", "reward", "sum of all rewards, undiscounted"),
     Column("success", "", "1 if the task was done"),
-    Column("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})"),
+    Column("termination", "", f"reason of the end: {ENDINGS} (`Task.done` has the conditions)"),
     Column("steps", STEPS, "length (in actions if the environment does not count control steps)"),
     Column(
         "peak_force", "N", "largest force of the impedance, or of the contact without an impedance, of any control step"

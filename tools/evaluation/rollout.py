@@ -1,4 +1,4 @@
-"""Loop over the actions of an episode, with callbacks, and the progress bar of many episodes."""
+"""Loop over the actions of an episode, with callbacks."""
 
 from __future__ import annotations
 

@@ -372,7 +372,7 @@ class GuidedVectorEnv(SyncVectorEnv):
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
         env_fns = list(env_fns)
         first = GuidedEnv(env_fns[0](), **keywords)
-        own = {
+        own = {  # arguments that are not part of the shared guide
             name: keywords[name]
             for name in ("pose", "to_action", "action_repeat", "observe", "check_env")
             if name in keywords
