@@ -113,7 +113,7 @@ class DiagramEnv(DrakeGymEnv):
     error.
 
     `RobotEnv` of packages/hardware overrides `_advance`, whose stop checks it adds, and uses `_begin_episode`, `_info`,
-    `_running`, `_failure`, `_neutral` and `_action_value`: change them together.
+    `_running`, `_failure`, `_neutral`, `_observation` and `_action_value`: change them together.
 
     Attributes:
         diagram: The `TaskDiagram`.

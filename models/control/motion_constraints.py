@@ -1,8 +1,8 @@
 """Constraints of a commanded motion (shapes, speed, acceleration and others), and a filter that satisfies them.
 
 Joint limits are a `StateConstraints` of `models/robots/joint_range.py`. `MotionLimits` are a robot's own limits, which
-packages/hardware enforces; the filter here does not use them. `CommandFilter`, `PrimitiveLaw` and residual guidance use
-the filter.
+packages/hardware enforces; the filter here does not use them. `CommandFilter` and `PrimitiveLaw` use the filter,
+so kgrl, skgrl, kmp and `GuidedEnv` do; residual guidance refuses limits.
 """
 
 from __future__ import annotations

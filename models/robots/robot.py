@@ -1,7 +1,7 @@
 """Robots and end effectors as data, and their registries.
 
-A robot of this package consists of a Python file and a model file. The Python file constructs a `Robot` and registers
-it by `register_robot`; `find_robot(name)` returns it. An installed package adds a robot by an entry point
+The robots of this package are in `catalog.py`, each with a model file and a row in `BUILT_IN` of
+`models/common/registry.py`; `find_robot(name)` returns one. An installed package adds a robot by an entry point
 "robot:NAME" of the group `guiderail` ("end_effector:NAME"), a script by a call of `register_robot`.
 """
 

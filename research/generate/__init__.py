@@ -36,7 +36,7 @@ def _session(name: str) -> Callable[..., None]:
 def _mixtures(*folder: Path) -> None:
     mixture = import_module("guiderail.models.primitives.mixture")
     connector, passage = (
-        import_module(f"guiderail.diagrams.tasks.{name}.task") for name in ("bnc_connector", "narrow_passage")
+        import_module(f"guiderail.diagrams.tasks.{name}") for name in ("bnc_connector", "narrow_passage")
     )
     arrays: dict[str, np.ndarray] = {}
     for path, components in [

@@ -2,8 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from guiderail.models.primitives.mixture import STORED_PATH
 from research.action_fuzzing.__main__ import main as action_fuzzing
 from research.benchmarks import BENCHMARKS
 from research.benchmarks.__main__ import main as benchmarks
@@ -69,6 +71,11 @@ def test_wrong_input_is_one_sentence_with_exit_code_2(program, arguments, messag
 
 
 def test_generator_writes_into_the_given_folder(tmp_path, capsys):
+    assert run(capsys, generate, "mixtures", "--out", tmp_path)[0] == 0
+    with np.load(tmp_path / STORED_PATH.name) as written, np.load(STORED_PATH) as stored:
+        assert set(written.files) == set(stored.files)
+        for name in stored.files:
+            np.testing.assert_allclose(written[name], stored[name], rtol=1e-6, atol=1e-9)
     assert run(capsys, generate, "clamp-objects", "--out", tmp_path)[0] == 0
     assert any(tmp_path.iterdir())
 

@@ -94,6 +94,7 @@ def write_digests(folder):
 
 
 def test_every_shipped_method_obeys_protocol_1():
+    pytest.importorskip("guiderail_parts", reason="a task of the protocol is a part")
     protocol = load_protocol(1)
     for method in shipped_methods().values():
         tasks = [name for name in protocol.tasks if method.applies(name)]
