@@ -28,10 +28,10 @@ FORGETTING = 0.99  # factor γ of the log-probabilities per sample, so that wron
 class SocketEstimator(LeafSystem):
     """Estimate the socket's axis relative to the plug with a histogram filter.
 
-        log P(s) ← γ log P(s) + r log p(c | p − s, a)   if f_z ≥ min_force and z ≥ lowest, otherwise unchanged
+        log P(s) ← γ log P(s) + r log p(c | p − s, a)   if f_z ≥ min_force, otherwise unchanged
         socket_offset = (m − p, C_xx, C_xy, C_yy),  m = Σ P(s) s,  C = Σ P(s) (s − m) (s − m)ᵀ
 
-    s is a position of the socket, one of `POSITIONS`; p is that of the plug in x and y, a its tilt, and c the center of
+    s is a position of the socket, one of `POSITIONS`; p is that of the plug, a its tilt, and c the center of
     pressure. All positions are initially equally likely.
 
     ``pose`` is X_TP and ``wrench`` the wrench about P in the axes of T, both (6,) [m, rad, N, Nm]. Samples that are not
@@ -41,13 +41,12 @@ class SocketEstimator(LeafSystem):
     Args:
         contact_map: Map of the parts; None leaves all positions equally likely.
         min_force: Force along z below which a sample is not used [N].
-        lowest: Height of the plug below which it is in the socket, and a sample is not used [m].
         period: Control period [s], positive.
     """
 
-    def __init__(self, contact_map: ContactMap | None, *, min_force: float, lowest: float, period: float):
+    def __init__(self, contact_map: ContactMap | None, *, min_force: float, period: float):
         super().__init__()
-        self._map, self._min_force, self._lowest = contact_map, min_force, lowest
+        self._map, self._min_force = contact_map, min_force
         self._state = self.DeclareDiscreteState(len(POSITIONS))  # log-probabilities, up to a constant
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
@@ -80,8 +79,8 @@ class SocketEstimator(LeafSystem):
         pose, wrench = self._pose_port.Eval(context), self._wrench_port.Eval(context)
         if self._map is None or not (is_finite(pose) and is_finite(wrench)):
             return
-        if wrench[2] < self._min_force or pose[2] < self._lowest:
+        if wrench[2] < self._min_force:
             return
         center = center_of_pressure(wrench, self._min_force)
-        change = RATE * self._map.log_likelihood(pose[:2], pose[4:], center, TICKS)[_INSIDE]
+        change = RATE * self._map.log_likelihood(pose[:3], pose[4:], center, TICKS)[_INSIDE]
         discrete_state.set_value(self._state, FORGETTING * self._log_probabilities(context) + change)

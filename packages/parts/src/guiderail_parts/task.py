@@ -431,7 +431,6 @@ class PartInsertion(DemonstratedInsertion):
         estimator = SocketEstimator(
             self._contact_map,
             min_force=MIN_CONTACT_FORCE,
-            lowest=self.file.motion.first_contact - IN_SOCKET,
             period=station.control_period,
         )
         wrench = station.GetOutputPort("wrench")

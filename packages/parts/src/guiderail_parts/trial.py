@@ -219,15 +219,15 @@ CONTACT_MAP = "contact_map.csv"  # name of the file in a task folder
 def add_contact_map(folder: Path, file: PartTaskFile, log: Callable[[str], None]) -> PartTaskFile:
     """Measure the contact map, write it into the folder, and return the task file that names it.
 
-    The file is returned unchanged if the plug never touches the rim.
+    The file is returned unchanged if the plug never touches the socket.
     """
     station = GantryStation(write_workcell(folder, file), time_step=file.time_step)
     contact_map = measure_contact_map(station, file.motion)
     if contact_map is None:
-        log("no contact map: the plug never touched the rim, so a general policy does not know where the socket is")
+        log("no contact map: the plug never touched the socket, so a general policy does not know where the socket is")
         return file
     contact_map.save(folder / CONTACT_MAP)
-    log(f"contact map: {len(contact_map.positions)} samples on the rim")
+    log(f"contact map: {len(contact_map.positions)} samples")
     return file.model_copy(update={"search": file.search.model_copy(update={"contact_map": CONTACT_MAP})})
 
 
