@@ -14,7 +14,7 @@ from guiderail_parts.socket_estimator import POSITIONS, RADIUS, SocketEstimator
 
 PERIOD = 0.02
 SOCKET = np.array([2.0, -1.5]) * MM
-
+HEIGHT = 10.0 * MM  # of the rim
 
 TILT = np.array([0.005, -0.002])
 
@@ -24,18 +24,19 @@ def center_at(relative, tilt=TILT):
     return np.array([3.0 * MM, 0.0]) + relative @ np.array([[0.8, 0.3], [-0.2, 0.5]]) + 0.2 * tilt
 
 
-def linear_map():
+def linear_map(height=HEIGHT):
     rng = np.random.default_rng(0)
     positions, tilts = rng.uniform(-6.0 * MM, 6.0 * MM, (600, 2)), rng.uniform(-0.015, 0.015, (600, 2))
-    return ContactMap(positions, tilts, np.array([center_at(*sample) for sample in zip(positions, tilts, strict=True)]))
+    centers = np.array([center_at(*sample) for sample in zip(positions, tilts, strict=True)])
+    return ContactMap(np.column_stack([positions, np.full(600, height)]), tilts, centers)
 
 
-def estimate(contact_map, *, plugs, force=8.0, height=0.01, center=None, changes=None):
+def estimate(contact_map, *, plugs, force=8.0, height=HEIGHT, center=None, changes=None):
     """Return the output (5,) after the plug was pressed on the rim at each position, ten samples each."""
     builder = DiagramBuilder()
     pose = add_system(builder, "pose", ConstantVectorSource(np.zeros(6)))
     wrench = add_system(builder, "wrench", ConstantVectorSource(np.zeros(6)))
-    system = SocketEstimator(contact_map, min_force=2.0, lowest=0.009, period=PERIOD)
+    system = SocketEstimator(contact_map, min_force=2.0, period=PERIOD)
     add_system(builder, "estimator", system, pose.get_output_port(), wrench.get_output_port())
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
@@ -62,8 +63,8 @@ def test_estimate_is_the_socket_relative_to_the_plug():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"contact_map": None}, {"force": 1.9}, {"height": 0.0089}, {"force": np.nan}],
-    ids=["no map", "no contact", "in the socket", "not finite"],
+    [{"contact_map": None}, {"force": 1.9}, {"height": 0.0}, {"force": np.nan}],
+    ids=["no map", "no contact", "far below the samples", "not finite"],
 )
 def test_without_usable_samples_every_position_stays_equally_likely(changes):
     *offset, xx, _, yy = estimate(changes.pop("contact_map", linear_map()) if changes else None, plugs=PLUGS, **changes)
@@ -83,6 +84,22 @@ def test_tilt_of_the_plug_does_not_move_the_estimate():
     assert errors[0] < 0.25 * MM < errors[1]
 
 
+def test_samples_of_another_rim_do_not_mislead():
+    upper, lower = linear_map(HEIGHT + 5.0 * MM), linear_map()
+    both = ContactMap(
+        *(
+            np.concatenate(pair)
+            for pair in zip(
+                (upper.positions, upper.tilts, -upper.centers),
+                (lower.positions, lower.tilts, lower.centers),
+                strict=True,
+            )
+        )
+    )
+    offset = estimate(both, plugs=PLUGS)[:2]
+    np.testing.assert_allclose(offset, SOCKET - PLUGS[-1], atol=0.3 * MM)
+
+
 def test_wrong_early_samples_are_forgotten():
     wrong = estimate(linear_map(), plugs=[PLUGS[0]] * 3, center=center_at(PLUGS[0] + SOCKET))
     assert np.linalg.norm(wrong[:2] - SOCKET) > 2.0 * MM
@@ -99,11 +116,11 @@ def test_map_is_read_as_written(tmp_path):
     np.testing.assert_allclose(read.centers, written.centers, atol=1e-7)
 
 
-HEADER = "x,y,tilt_y,tilt_x,center_x,center_y\n"
+HEADER = "x,y,z,tilt_y,tilt_x,center_x,center_y\n"
 
 
 @pytest.mark.parametrize(
-    "text", ["", "x,y\n1,2\n", *(HEADER + row for row in ("", "1,2,0,0,3,word", "1,2,0,0,3,nan", "1,2,3"))]
+    "text", ["", "x,y\n1,2\n", *(HEADER + row for row in ("", "1,2,0,0,0,3,word", "1,2,0,0,0,3,nan", "1,2,3"))]
 )
 def test_damaged_file_is_refused(tmp_path, text):
     path = tmp_path / "contact_map.csv"
