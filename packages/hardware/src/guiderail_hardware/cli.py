@@ -64,8 +64,9 @@ class RobotOptions:
 
 @cli.command("deploy runs/connector --sim --yes")
 def deploy(
-    run: Annotated[Path, argument("Folder of a run, or pretrained:NAME ({pretrained}).", "RUN")],
+    run: Annotated[Path, argument("Folder of a run or of a policy, or pretrained:NAME ({pretrained}).", "RUN")],
     robot: RobotOptions,
+    task: cli.PolicyTask = None,
     force_limit: Annotated[
         float | None, option("Force limit of a first motion [N].  [default and maximum: that of the training]")
     ] = None,
@@ -98,7 +99,15 @@ def deploy(
         from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
 
         result = evaluate_on_robot(
-            run, connection, episodes, station=station, policy=policy, assume_yes=yes, out=out, log=print_message
+            run,
+            connection,
+            episodes,
+            task=task,
+            station=station,
+            policy=policy,
+            assume_yes=yes,
+            out=out,
+            log=print_message,
         )
         print_result(result, as_json)
         return
@@ -107,7 +116,14 @@ def deploy(
     from guiderail_hardware.robot.executor import deploy as deploy_policy
 
     code = deploy_policy(
-        run, connection, station=station, force_limit=force_limit, assume_yes=yes, out=out, log=print_progress
+        run,
+        connection,
+        task=task,
+        station=station,
+        force_limit=force_limit,
+        assume_yes=yes,
+        out=out,
+        log=print_progress,
     )
     raise typer.Exit(code)
 

@@ -16,9 +16,11 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.station import max_wrench
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.cli.main import main
 from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.pretrained import find_run
 from guiderail_hardware.models.joint_status import Fault, StatusLimits
 from guiderail_hardware.robot import executor as executing
 from guiderail_hardware.robot import preflight
@@ -279,6 +281,16 @@ def test_deploy_exits_with_2_when_there_is_no_run(capsys, tmp_path):
         main(["deploy", str(tmp_path), "--sim"])
     assert end.value.code == 2
     assert "not a run" in capsys.readouterr().err
+
+
+def test_policy_without_a_run_acts_in_a_named_task(tmp_path):
+    policy = Policy.load(find_run("pretrained:connector"))
+    policy.description["environment"] = {"guidance": "kgrl"}
+    policy.save(tmp_path)
+    with pytest.raises(InputError, match="name the task"):
+        executing.configuration(tmp_path, None)
+    config = executing.configuration(tmp_path, "BncConnector")
+    assert (config.task, config.environment["guidance"]) == ("BncConnector", "kgrl")
 
 
 def test_deploy_exits_with_2_when_the_driver_moves_another_robot(capsys):

@@ -27,9 +27,11 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.policy import Policy
+from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
+from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.files import check_writable, write_atomically
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail_hardware.drivers.clock import Clock, garbage_collection_disabled, set_realtime_priority
 from guiderail_hardware.drivers.driver import describe_stop
@@ -324,6 +326,7 @@ def deploy(
     run: Path,
     connection: RobotConnection,
     *,
+    task: str | None = None,
     station: str = "hardware",
     force_limit: float | None = None,
     assume_yes: bool = False,
@@ -335,6 +338,7 @@ def deploy(
     Args:
         run: Run folder, or `pretrained:NAME`.
         connection: Connection to the robot driver.
+        task: Task or task folder in which a policy without a run acts; None for a run.
         station: Name of a hardware station.
         force_limit: Contact force above which the arm is stopped [N], by default the limit of the training. A lower
             limit makes the first motion on a robot safer; a higher limit is refused.
@@ -350,26 +354,25 @@ def deploy(
             the recording, the force limit is above the limit of the training, no robot answers, a check fails or is not
             confirmed, or a signal arrives before the arm may move.
     """
-    folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
-    config, policy = folder.config(), Policy.load(folder.path)
-    config.refuse_changed_task(folder.path)
+    config, policy = configuration(run, task), Policy.load(find_run(run))
+    recordings = out or recordings_folder(run)
     check_writable(step_log_file(recordings, 0))
     environment = hardware_environment(config.task, config.environment, station)
     environment |= connection.environment_options(station)
     resolved = EnvConfig.resolve(config.task, environment)
-    task = resolved.declared
-    if not isinstance(task, InsertionTask):
+    declared = resolved.declared
+    if not isinstance(declared, InsertionTask):
         raise InputError(f"{config.task} has no start pose for an arm: deploy the policy of an insertion")
     check_room(step_log_file(recordings, 0), record_size(resolved.num_steps))
     if force_limit is not None:
-        if not force_limit <= task.largest_force_limit:
+        if not force_limit <= declared.largest_force_limit:
             raise InputError(
-                f"the policy was learned with a force limit of {task.largest_force_limit:g} N: give a lower one"
+                f"the policy was learned with a force limit of {declared.largest_force_limit:g} N: give a lower one"
             )
         name = "force_limit" if environment.get("force_limit_range") is None else "force_limit_range"
         environment[name] = force_limit if name == "force_limit" else (force_limit, force_limit)
-        task = EnvConfig.resolve(config.task, environment).declared
-        assert isinstance(task, InsertionTask)
+        declared = EnvConfig.resolve(config.task, environment).declared
+        assert isinstance(declared, InsertionTask)
     skill = make_skill(config.task, policy, **environment)
     skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
     with (
@@ -379,14 +382,14 @@ def deploy(
         clock, wall_clock = connection.clocks(skill_station)
         watch_process(clock, process)
         log(f"waiting for {connection.robot} on {skill_station.driver}")
-        executor = SkillExecutor(task, skill, clock, keys.is_stop_requested)
+        executor = SkillExecutor(declared, skill, clock, keys.is_stop_requested)
         checks = confirm_checks(executor.preflight, log, assume_yes=assume_yes)
         if not connection.synchronous and not set_realtime_priority():
             log(NO_REALTIME_PRIORITY)
         log(keys.describe())
         metadata: dict[str, Any] = {
             "task": config.task,
-            "run": folder.path.name,
+            "run": find_run(run).name,
             "robot": connection.robot,
             "sim": connection.sim,
             "checks": {check.name: check.description for check in checks},
@@ -403,6 +406,18 @@ def deploy(
             finally:
                 executor.save(recordings, outcome, {**metadata, **connection.timing(skill_station, wall_clock)}, log)
     return outcome.exit_code
+
+
+def configuration(run: Path, task: str | None) -> RunConfig:
+    """Return the configuration of a run, or that of `task`, a task or its folder, for a policy without a run.
+
+    Raises:
+        InputError: If there is no such run, policy or task, or the task of the run has changed.
+    """
+    name, imports = (None, ()) if task is None else task_named(task)
+    config = find_subject(run, name).config
+    assert config is not None
+    return config if task is None else replace(config, imports=imports)
 
 
 def recordings_folder(run: Path) -> Path:

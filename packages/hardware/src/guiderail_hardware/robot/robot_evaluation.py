@@ -23,7 +23,7 @@ from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
-from guiderail_hardware.robot.executor import hardware_environment, recordings_folder
+from guiderail_hardware.robot.executor import configuration, hardware_environment, recordings_folder
 from guiderail_hardware.robot.records import write_record
 from guiderail_hardware.robot.session import robot_session
 
@@ -37,6 +37,7 @@ def evaluate_on_robot(
     connection: RobotConnection,
     episodes: int,
     *,
+    task: str | None = None,
     station: str = "hardware",
     policy: str | None = None,
     assume_yes: bool = False,
@@ -52,6 +53,7 @@ def evaluate_on_robot(
         run: Run folder, or `pretrained:NAME`.
         connection: Connection to the robot driver.
         episodes: Number of episodes, at least 1.
+        task: Task or task folder in which a policy without a run acts; None for a run.
         station: Name of a hardware station.
         policy: Name of a baseline or scripted policy that replaces the run's own; None for the run's own.
         assume_yes: Do not ask for confirmation.
@@ -68,11 +70,9 @@ def evaluate_on_robot(
     """
     if episodes < 1:
         raise InputError(f"a number of episodes is at least one, not {episodes}")
-    folder = RunFolder(find_run(run))
-    config = folder.config()
-    config.refuse_changed_task(folder.path)
+    config = configuration(run, task)
     make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
-    own_policy = Policy.load(folder.path) if policy is None else None
+    own_policy = Policy.load(find_run(run)) if policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
     if environment.get("reward") != config.environment.get("reward"):
         log(f"mean_return is of the reward {environment['reward']!r}, because the run's reward needs simulation state")
