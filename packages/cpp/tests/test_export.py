@@ -1,7 +1,4 @@
-"""Exported skills in C++: equal to Python without allocations, and run as a controller and a node with a double of ROS 2.
-
-Programs are tested with the address and undefined behavior sanitizers, too.
-"""
+"""Exported skills in C++: laws equal to Python's, and a controller and a node with a double of ROS 2."""
 
 import functools
 import json
