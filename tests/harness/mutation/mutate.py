@@ -153,7 +153,9 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owne
                 setattr(owner, key, value)
         elif isinstance(value, CONSTANTS) and not np.array_equal(value, before):
             for user in list(sys.modules.values()):
-                if vars(user).get(key) is before and user.__name__.split(".")[0] in ("guiderail", *TEST_MODULES):
+                top = user.__name__.split(".")[0]
+                # The package or a sibling, such as guiderail_hardware, or a test.
+                if vars(user).get(key) is before and (top.startswith("guiderail") or top in TEST_MODULES):
                     setattr(user, key, value)
 
 
