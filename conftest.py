@@ -25,7 +25,7 @@ WITH_HANDLERS = (
 # Files that take longest. They run first, so that no worker begins one of them while the others have nothing left.
 SLOW = (
     "parts/tests/test_create_task.py", "calibration/tests/test_calibrate.py", "docs/test_tutorials.py",
-    "third_party/test_peglab.py", "cpp/tests/test_export.py", "cpp/tests/test_laws.py", "robot/test_train.py",
+    "third_party/test_peglab.py", "cpp/tests/test_export.py", "robot/test_train.py",
     "studies/tests/test_contact_probe.py", "parts/tests/test_batch.py", "docs/test_notebooks.py",
 )  # fmt: skip
 

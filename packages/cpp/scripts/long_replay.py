@@ -17,8 +17,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from random_laws import LAWS, TOLERANCE, TOLERANCES
-from test_laws import FLAGS
 
+FLAGS = {"optimized": ["-O2"], "sanitized": ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]}
 RUNS = 3  # runs of the optimized program, of which the shortest times count
 ACTIVE = 33.0  # required share of the steps with an active constraint [%]
 FREE = ("policy", "whole skill of the connector")  # a network has no constraints, and this policy stays inside of them

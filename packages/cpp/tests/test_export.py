@@ -1,13 +1,17 @@
-"""Exported folder: it builds, replays its recording, and runs as a controller and a node with a double of ROS 2."""
+"""Exported skills in C++: laws equal to Python's, and a controller and a node with a double of ROS 2."""
 
 import functools
 import json
+import re
 import shutil
 import subprocess
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
+from random_laws import LAWS, TOLERANCE, TOLERANCES
+from safetensors.numpy import load, save
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PrimitiveLaw
@@ -17,9 +21,11 @@ from guiderail_cpp.project import export_cpp
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
 HERE = Path(__file__).parent
-
-
-SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SOURCE = Path(str(files("guiderail_cpp")))
+REPLAY = SOURCE / "files/test/replay.cpp"
+STEPS = 800
+# Sanitizers without optimization: a program is compiled three times as fast.
+SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 @pytest.fixture(scope="module")
@@ -36,18 +42,14 @@ def exported(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def compiled(exported, tmp_path_factory):
-    """Return a function that compiles a program once with the headers of the connector and returns its path.
-
-    The headers are the same in every export; `skill.safetensors` has all that differs.
-    """
-    root = tmp_path_factory.mktemp("programs")
+def compiled(tmp_path_factory):
+    """Return a function that compiles a program once and returns its path."""
 
     @functools.cache
     def compile_program(source, *options):
-        command = ["g++", "-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *options]
-        program = root / source.stem
-        subprocess.run([*command, "-I", exported("connector") / "include", source, "-o", program], check=True)
+        command = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *options]
+        program = tmp_path_factory.mktemp("programs") / source.stem
+        subprocess.run([*command, "-I", SOURCE / "include", source, "-o", program], check=True)
         return program
 
     return compile_program
@@ -56,35 +58,58 @@ def compiled(exported, tmp_path_factory):
 def run(program, *files):
     result = subprocess.run([program, *files], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@needs_compiler
+@pytest.mark.parametrize("law", LAWS)
+def test_law_equals_python_to_1e_12_without_allocations(law, compiled, tmp_path):
+    data, recording = (tmp_path / name for name in ("data.safetensors", "recording.safetensors"))
+    for path, content in zip((data, recording), LAWS[law](STEPS), strict=True):
+        path.write_bytes(content)
+    for flags in (("-O2",), SANITIZED):
+        printed = run(compiled(REPLAY, *flags), data, recording, str(TOLERANCES.get(law, TOLERANCE)))
+        assert re.search(f"^{STEPS} steps, .* 0 allocations", printed)
+
+
+@needs_compiler
+def test_replay_fails_when_a_command_differs(compiled, tmp_path):
+    data, recording = LAWS["governor"](50)
+    (tmp_path / "data").write_bytes(data)
+    arrays = load(recording)
+    arrays["replay/reference"][-1, 0] += 2e-12
+    (tmp_path / "recording").write_bytes(save(arrays))
+    command = [compiled(REPLAY, "-O2"), tmp_path / "data", tmp_path / "recording"]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 1
 
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["connector", "passage", "clamp", "pouring"])
 def test_exported_skill_replays_the_commands_of_its_environment(name, exported, compiled):
-    folder, shared = exported(name), exported("connector")
-    for file in [*(shared / "include").rglob("*.hpp"), shared / "test/replay.cpp"]:
-        assert (folder / file.relative_to(shared)).read_bytes() == file.read_bytes()
-    program = compiled(shared / "test/replay.cpp")
-    run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
+    folder = exported(name)
+    for file in [*(SOURCE / "include").rglob("*.hpp"), REPLAY]:  # compiled once for all skills
+        copied = folder / ("test/replay.cpp" if file == REPLAY else file.relative_to(SOURCE))
+        assert copied.read_bytes() == file.read_bytes()
+    run(compiled(REPLAY, "-O2"), folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
 def test_controller_and_node_run_the_skill_with_a_double_of_ros2(exported, compiled):
     folder = exported("connector")
-    program = compiled(HERE / "ros2_test.cpp", "-I", HERE / "ros2_double", "-I", folder / "ros2/src")
+    program = compiled(HERE / "ros2_test.cpp", "-O1", "-I", HERE / "ros2_double", "-I", folder / "ros2/src")
     run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
 def test_runner_survives_wrong_measurements_and_keeps_its_limits(exported, compiled):
     folder = exported("connector")
-    program = compiled(HERE / "runner_test.cpp", *SANITIZERS)
+    program = compiled(HERE / "runner_test.cpp", *SANITIZED)
     run(program, folder / "skill.safetensors", folder / "test/recording.safetensors")
 
 
 @needs_compiler
 def test_damaged_template_is_refused_when_it_is_read(exported, compiled):
-    run(compiled(HERE / "runner_test.cpp", *SANITIZERS), exported("pouring") / "skill.safetensors")
+    run(compiled(HERE / "runner_test.cpp", *SANITIZED), exported("pouring") / "skill.safetensors")
 
 
 def test_description_lists_signals_and_action(exported):

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 
 import gymnasium
@@ -334,12 +334,23 @@ def test_scripted_search_follows_the_plug_below_the_rim(folder):
     assert act(time + 0.05, inserted + BLOCKED + 1e-3) - start == pytest.approx(-0.05 * file.search.speed)  # blocked
 
 
+@contextmanager
+def few_demonstrations():
+    """Record three demonstrations instead of ten."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])
+        patch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
+        patch.setattr(create_task_module, "NUM_DEMONSTRATIONS", 3)
+        yield
+
+
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
     """Return the task folder of the square peg with an unknown turn of the socket of up to 4.5°."""
     parent = tmp_path_factory.mktemp("turning")
     plug, socket = PARTS["square_peg"]().write(parent)
-    create_task(plug, socket, parent / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
+    with few_demonstrations():
+        create_task(plug, socket, parent / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
     return parent / "turning_peg"
 
 
@@ -371,18 +382,11 @@ def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
     np.testing.assert_array_equal(search(observation), np.zeros(3))  # a new episode
 
 
-@pytest.fixture
-def few_demonstrations(monkeypatch):
-    """Record three demonstrations."""
-    monkeypatch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])
-    monkeypatch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
-    monkeypatch.setattr(create_task_module, "NUM_DEMONSTRATIONS", 3)
-
-
-def test_screw_is_inserted_by_a_turn_with_its_pitch(few_demonstrations, tmp_path, capsys):
+def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
     part = screw()
     arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
-    call("create-task", *arguments, *part.options)
+    with few_demonstrations():
+        call("create-task", *arguments, *part.options)
     assert "3 of 3" in capsys.readouterr().out
     file = read_task_file(tmp_path / "screw")
     assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
@@ -614,11 +618,12 @@ def test_plug_without_a_stop_is_not_pushed_past_the_target(tmp_path):
     plug.apply_translation((0.0, 0.0, 15.0)).export(tmp_path / "plug.stl")
     plate.apply_translation((0.0, 0.0, 5.0)).export(tmp_path / "socket.stl")
     files, logged = (tmp_path / "plug.stl", tmp_path / "socket.stl", tmp_path / "task"), []
-    create_task(*files, unit="mm", hard_episodes=0, log=logged.append)
+    with few_demonstrations():
+        create_task(*files, unit="mm", hard_episodes=0, log=logged.append)
     assert any(line.startswith("nothing stops the plug at the seated pose") for line in logged)
     created = yaml.safe_load((tmp_path / "task" / "task.yaml").read_text())
     assert created["motion"]["push"] == 0.0
-    assert int(created["measured"]["demonstrations_seated"][0]) >= 3
+    assert created["measured"]["demonstrations_seated"] in ("2 of 3", "3 of 3")
 
 
 def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
+from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.bnc_connector import (
     ALIGNMENT,
     NUM_STEPS,
@@ -174,14 +175,15 @@ def test_single_demonstration_requires_prior_std(tmp_path):
 
 def test_action_displaces_the_command_by_the_prior_std():
     """An action of 1 displaces the command by √3 standard deviations: 3 mm for a prior of 1.73 mm."""
-    env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR_STD, bound=6.0 * MM)
-    commands = []
+    law = make_law(make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR_STD, bound=6.0 * MM))
+    pose, commands = law.primitive.reference.means[0], []
     for action in (0.0, 1.0):
-        env.reset(seed=0)
-        for _ in range(30):
-            env.step(np.array([action, 0.0]))
-        commands.append(env.trace.commanded[:, 0].copy())
-    env.close()
+        state, columns = law.start(pose), []
+        for _ in range(300):
+            command = law.command(state, np.array([action, 0.0]), pose, np.zeros(6))
+            state = law.next(state, command, pose)
+            columns.append(command.pose[0])
+        commands.append(np.array(columns))
     assert np.mean(commands[1] - commands[0]) == pytest.approx(3.0 * MM, rel=0.15)
 
 
@@ -211,12 +213,6 @@ def test_aligned_reward_is_proportional_to_the_approach():
     approach = 2.0 * MM - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
     assert reward > 1.0
     assert reward == pytest.approx(ALIGNMENT_REWARD * approach / MM, abs=0.5)
-
-
-def test_torque_search_locks_on_the_arm():
-    """The scripted policy was written for the gantry; the arm follows commands more slowly."""
-    env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", station="arm")
-    assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[0]["is_success"]
 
 
 class TestUncertainty:
