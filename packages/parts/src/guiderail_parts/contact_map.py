@@ -123,11 +123,11 @@ class ContactMap:
         # The kernel is a product over x, y, and height with tilt.
         along_x, along_y = (kernel(plug[axis] - ticks, positions[:, axis]) for axis in (0, 1))
         terms = terms * _by_height_and_tilt(plug[None], tilt[None], positions, tilts).T
-        sums = np.einsum("in,njk->ijk", along_x, along_y.T[:, :, None] * terms[:, None, :], optimize=True)
-        difference = centers.mean(axis=0) + sums[:, :, :2] - center
+        x, y, error, number = ((along_x * term) @ along_y.T for term in terms.T)
+        known_x, known_y = centers.mean(axis=0) - center
         # Far from all samples, the variance is that of all centers of pressure.
-        variance = (sums[:, :, 2] + WEAK * whole) / (sums[:, :, 3] + WEAK) + MIN_DEVIATION**2
-        likelihood = np.exp(-0.5 * (difference**2).sum(axis=2) / variance) / variance
+        variance = (error + WEAK * whole) / (number + WEAK) + MIN_DEVIATION**2
+        likelihood = np.exp(-0.5 * ((known_x + x) ** 2 + (known_y + y) ** 2) / variance) / variance
         return np.asarray(np.log(likelihood + OUTLIERS / (whole + MIN_DEVIATION**2)))
 
 
