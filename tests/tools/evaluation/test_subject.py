@@ -38,10 +38,9 @@ def test_policy_without_a_run_needs_a_task(policy):
         find_subject(policy, None)
 
 
-def test_result_without_a_run_states_guidance_and_observation(tmp_path):
-    Policy.load(find_run("pretrained:passage")).save(tmp_path / "policy")
-    scope = evaluate(tmp_path / "policy", "NarrowPassage", 1, baselines=(), processes=1)["evaluation_scope"]
-    assert scope.endswith(", guidance=skgrl, difficulty=standard, observation=state, action_repeat=5")
+def test_result_without_a_run_states_guidance_and_observation(policy):
+    scope = evaluate(policy, "BncConnector", 1, baselines=(), processes=1)["evaluation_scope"]
+    assert scope.endswith(", guidance=kgrl, difficulty=standard, observation=mean_contact_point, action_repeat=10")
 
 
 def test_run_of_an_environment_that_was_given_as_an_object_names_the_way_in_python():
