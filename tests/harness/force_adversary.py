@@ -1,31 +1,109 @@
-"""Adversarial actions against the force limit: random, constant, extreme and bang-bang, for all stations and guidance.
+"""Adversarial actions against the force limit: random, held, extreme and bang-bang, and a search over whole episodes.
 
-    python tests/harness/force_adversary.py --steps 100000            # an hour on one core; 0 stops are expected
+    python tests/harness/force_adversary.py --steps 100000 --out forces.csv  # an hour on one core; 0 stops are expected
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
 
-A line of JSON is printed for each case: control steps, terminations, the smallest energy in the tank [J], and three
-forces relative to the limit of the episode. These are the largest impedance force, the largest measured contact force,
-and the largest unfiltered contact force of a plant step. The exit code is 1 if an episode ended by force.
+A case is a task at difficulty=hard, on a station, with a contact of a given stiffness. Each round of a case draws a
+guidance and a range of force limits, on an arm also a payload that its controller does not model, and on the gantry a
+factor of the moving mass. Half of the episodes belong to an evolution strategy, which changes actions or conditions of
+the episode with the largest transient force.
+
+The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md), relative to the
+limit of the episode plus the weight of the payload. It is printed, and written to `--out`. A run continues from that
+file; only the search starts again then. The exit code is 1 if an episode ended by force, or if a force exceeded its
+bound.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import json
+import csv
+import math
 import sys
-from collections import Counter
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.stations.station import CONTACT_STIFFNESS
+from guiderail.models.control.wrench import FORCE_SHARES
 
 GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
 STATIONS = ("gantry", "arm", "mujoco")
+# Stiffness of the contact with the rim [N/mm], measured on the gantry with pressures of 4.5 and 9 N, and the factor of
+# the contact's modulus that causes it.
+DRAKE = {
+    "BncConnector": {2460: 1.0, 192: 6.5e-4, 98: 3e-4, 24: 7e-5},
+    "GridClamp": {2300: 1.0, 199: 0.08, 96: 0.035, 29: 7e-3},
+}
+CONTACTS = {
+    "gantry": DRAKE,
+    "arm": DRAKE,
+    "mujoco": {"BncConnector": {3790: 1.0, 187: 7e-4, 90: 2.2e-4}, "GridClamp": {154000: 1.0, 185: 1.1e-3, 99: 3e-4}},
+}
 ATTACKS = ("random", "constant", "extreme", "bang_bang")
+LIMITS = (8.0, 25.0)  # range of sampled force limits [N]
+PAYLOADS = (0.0, 0.25, 0.5)  # a weight of up to 5 N, the largest that is not refused before a motion [kg]
+MASS_FACTORS = (0.8, 1.0, 1.2)
+GRAVITY = 9.81  # [m/s²]
+MASS = {"gantry": 1.5, "arm": 8.0, "mujoco": 1.5}  # moving mass of the bounds [kg]
+DELAY = {"gantry": 0.0, "arm": 0.005, "mujoco": 0.0}  # period of a controller that is not solved with the contact [s]
 SEED = 2_100_000
+ROUND = 2000  # control steps of a round
+
+
+@dataclass
+class Case:
+    """Statistics of the attacks on a task; contact forces are relative to the limit of the episode plus the weight."""
+
+    task: str
+    station: str
+    stiffness: int  # of the contact [N/mm]
+    rounds: int = 0
+    episodes: int = 0
+    control_steps: int = 0
+    plant_steps: int = 0
+    stops: int = 0  # episodes that ended by force
+    tank_J: float = math.inf  # smallest content of the energy tank
+    impedance: float = 0.0  # force of the impedance, relative to the limit
+    filtered: float = 0.0  # contact force, filtered with 10 ms
+    quasi_static: float = 0.0  # contact force that lasts 0.5 s
+    quasi_static_bound: float = 0.0
+    transient: float = 0.0  # contact force in a single plant step
+    transient_bound: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.quasi_static_bound = round(math.hypot(*FORCE_SHARES), 3)
+        self.transient_bound = round(transient_bound(1e3 * self.stiffness, MASS[self.station], DELAY[self.station]), 2)
+
+    @property
+    def has_failed(self) -> bool:
+        """True if an episode ended by force, or a force exceeded its bound."""
+        return (
+            self.stops > 0
+            or self.quasi_static > self.quasi_static_bound + 1e-3
+            or self.transient > self.transient_bound
+        )
+
+
+def transient_bound(stiffness: float, mass: float, delay: float) -> float:
+    """Return the bound of a transient contact's force, relative to the limit.
+
+    Args:
+        stiffness: Stiffness of the contact [N/m].
+        mass: Moving mass [kg].
+        delay: Period of the controller, 0 if spring and damper are solved with the contact [s].
+    """
+    ratio, peak = stiffness / CONTACT_STIFFNESS, 1.0
+    if ratio > 1.0:
+        phase = (math.pi - math.acos(1.0 / math.sqrt(ratio))) / math.sqrt(ratio - 1.0)
+        peak += 0.5 * math.sqrt(ratio) * math.exp(-phase)
+    return peak + delay * math.sqrt(stiffness / mass)
 
 
 def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
@@ -38,42 +116,114 @@ def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.nd
     return lambda: rng.choice([-1.0, 1.0], size)
 
 
-def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
-    """Run attacks in an environment for at least `steps` control steps; return the statistics."""
-    env = make_env(task, action_repeat=5, **options)
-    done, terminations, force, contact, step_contact, energy = 0, Counter[str](), 0.0, 0.0, 0.0, np.inf
-    for episode in itertools.count():
-        rng = np.random.default_rng([SEED, episode])
-        act = attack(ATTACKS[episode % len(ATTACKS)], rng, env.action_space.shape[0])
-        *_, info = env.reset(seed=SEED + episode, options={"new_run": True})
+@dataclass
+class Search:
+    """Evolution strategy over episodes: held actions of a sampled duration, and the seed of the conditions."""
+
+    SEGMENTS, LONGEST = 40, 20  # number of held actions, their longest duration in actions
+
+    seed: int = -1
+    actions: np.ndarray | None = None  # (SEGMENTS, size)
+    lengths: np.ndarray | None = None  # (SEGMENTS,)
+    force: float = -1.0  # largest transient force of the best episode, relative to its limit
+
+    def changed(self, rng: np.random.Generator, size: int, seed: int) -> Search:
+        """Return a new candidate: changes of the best one, or random actions with the conditions of `seed`."""
+        actions, lengths = rng.choice([-1.0, 0.0, 1.0], (self.SEGMENTS, size)), self._lengths(rng)
+        if self.actions is None or rng.random() < 0.1:
+            return Search(seed, actions, lengths)
+        is_kept = rng.random(self.SEGMENTS) > rng.choice([0.05, 0.15, 0.4])
+        actions = np.where(is_kept[:, None], self.actions, actions)
+        lengths = np.where(rng.random(self.SEGMENTS) > 0.1, self.lengths, lengths)
+        return Search(seed if rng.random() < 0.1 else self.seed, actions, lengths)
+
+    def _lengths(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.integers(1, self.LONGEST, self.SEGMENTS)
+
+    def act(self) -> Callable[[], np.ndarray]:
+        """Return a function that returns the next action (size,)."""
+        sequence = iter(np.repeat(self.actions, self.lengths, axis=0))
+        return lambda: next(sequence, self.actions[-1])
+
+
+def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool) -> None:
+    """Run attacks for at least `steps` control steps and add them to a case; `searches` are by the guidance."""
+    rng = np.random.default_rng([SEED, STATIONS.index(case.station), case.stiffness, case.rounds])
+    guidance = str(rng.choice(GUIDANCE[case.task]))
+    options: dict[str, Any] = {"guidance": guidance, "station": case.station, "difficulty": "hard"}
+    if rng.random() < 0.5:
+        options["force_limit_range"] = LIMITS
+    payload = float(rng.choice(PAYLOADS)) if case.station == "arm" else 0.0
+    factor = float(rng.choice(MASS_FACTORS)) if case.station == "gantry" else 1.0
+    if payload > 0.0:
+        options["disturbances"] = {"payload": payload}
+    env = make_env(case.task, action_repeat=5, bounded_force=bounded, **options)
+    size, best, done = env.action_space.shape[0], searches.setdefault(guidance, Search()), 0
+    station, modulus = station_of(env), CONTACTS[case.station][case.task][case.stiffness]
+    while done < steps:
+        seed, candidate = SEED + case.episodes, None
+        if case.episodes % 2:
+            candidate = best.changed(rng, size, seed)
+            seed, act = candidate.seed, candidate.act()
+        else:
+            act = attack(ATTACKS[case.episodes // 2 % len(ATTACKS)], rng, size)
+        *_, info = env.reset(seed=seed, options={"new_run": True})
+        station.set_contact(env.simulator.get_mutable_context(), 1.0, modulus)
+        if factor != 1.0:
+            scale_mass(env, factor)
         limit = info.get("force_limit", env.diagram.task.collision.above)
-        terminated = truncated = False
-        unfiltered = watch_contact(env)
+        scale = limit + GRAVITY * payload
+        forces, terminated, truncated = watch_contact(env), False, False
         while not (terminated or truncated):
             *_, terminated, truncated, info = env.step(act())
-        terminations[info["termination"]] += 1
+        transient = max(forces) / scale
+        if candidate is not None and transient > best.force:
+            candidate.force = transient
+            searches[guidance] = best = candidate
+        wrench = env.trace.signals["wrench"][:, :3]
+        case.episodes, case.control_steps = case.episodes + 1, case.control_steps + info["control_steps"]
+        case.plant_steps += round(info["control_steps"] * env.diagram.control_period / station.time_step)
+        case.stops += info["termination"] == "collision"
+        case.impedance = max(case.impedance, round(float(env.trace.force.max()) / limit, 3))
+        case.filtered = max(case.filtered, round(float(np.linalg.norm(wrench, axis=1).max()) / scale, 3))
+        case.quasi_static = max(case.quasi_static, round(env.trace.statistics()["quasi_static_force"] / scale, 3))
+        case.transient = max(case.transient, round(transient, 3))
+        case.tank_J = min(case.tank_J, round(tank_content(env), 2))
         done += info["control_steps"]
-        force = max(force, float(env.trace.force.max()) / limit)
-        contact = max(contact, float(np.linalg.norm(env.trace.signals["wrench"][:, :3], axis=1).max()) / limit)
-        step_contact = max(step_contact, max(unfiltered) / limit)
-        energy = min(energy, tank_content(env))
-        if done >= steps:
-            break
+    case.rounds += 1
     env.close()
-    return {
-        "steps": done,
-        "terminations": dict(terminations),
-        "force_per_limit": round(force, 3),
-        "contact_per_limit": round(contact, 3),
-        "step_contact_per_limit": round(step_contact, 3),
-        "tank_J": round(energy, 2),
-    }
 
 
-def watch_contact(env: object) -> list[float]:
-    """Return a list to which every step of Drake's plant adds the norm of the contact forces [N]; [0] in MuJoCo."""
-    plant = env.diagram.diagram.GetSubsystemByName("station").plant
-    contact, forces = plant.get_contact_results_output_port(), [0.0]
+def station_of(env: Any) -> Any:
+    """Return the station of an environment, without its disturbances."""
+    station = env.diagram.diagram.GetSubsystemByName("station")
+    return getattr(station, "_inner", station)
+
+
+def scale_mass(env: Any, factor: float) -> None:
+    """Multiply the masses of all bodies by a factor."""
+    plant = station_of(env).plant
+    context = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
+    for number in range(1, plant.num_bodies()):  # number 0 is the world
+        body = plant.get_body(BodyIndex(number))
+        body.SetMass(context, factor * body.default_mass())
+
+
+def watch_contact(env: Any) -> list[float]:
+    """Return a list to which every step of the physics adds the norm of the contact forces [N]."""
+    station, forces = station_of(env), [0.0]
+    gantry, plant = getattr(station, "gantry", None), station.plant
+    if station.plant.time_step() == 0.0:  # MuJoCo
+        inner = type(gantry)._contact_wrench
+
+        def contact_wrench() -> np.ndarray:
+            wrench = inner(gantry)
+            forces.append(float(np.linalg.norm(wrench[:3])))
+            return wrench
+
+        gantry._contact_wrench = contact_wrench
+        return forces
+    contact = plant.get_contact_results_output_port()
 
     def add(root: Context) -> EventStatus:
         results = contact.Eval(plant.GetMyContextFromRoot(root))
@@ -84,18 +234,36 @@ def watch_contact(env: object) -> list[float]:
         forces.append(float(np.linalg.norm(np.sum(pushes, axis=0))))
         return EventStatus.DidNothing()
 
-    if plant.time_step() > 0.0:
-        env.simulator.set_monitor(add)
+    env.simulator.set_monitor(add)
     return forces
 
 
-def tank_content(env: object) -> float:
+def tank_content(env: Any) -> float:
     """Return the energy in the station's tank [J], infinite without a tank."""
-    station = env.diagram.diagram.GetSubsystemByName("station")
+    station = station_of(env)
     if not station.HasSubsystemNamed("tank"):
-        return np.inf
+        return math.inf
     tank = station.GetSubsystemByName("tank")
     return float(tank.get_energy_output_port().Eval(tank.GetMyContextFromRoot(env.simulator.get_context()))[0])
+
+
+def read(path: Path | None) -> list[Case]:
+    """Return the cases in a table, none without a table."""
+    if path is None or not path.exists():
+        return []
+    types = {entry.name: {"str": str, "int": int, "float": float}[str(entry.type)] for entry in fields(Case)}
+    with path.open(newline="") as file:
+        return [Case(**{name: types[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
+
+
+def write(cases: list[Case], path: Path) -> None:
+    """Write a table."""
+    temporary = path.with_suffix(".part")
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [entry.name for entry in fields(Case)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(map(asdict, cases))
+    temporary.replace(path)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -105,24 +273,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--bounded", choices=("true", "false"), default="true", help="option bounded_force")
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
+    parser.add_argument("--out", type=Path, help="CSV file of the table, from which a run continues")
     args = parser.parse_args(arguments)
-    cases = [
-        (task, {"guidance": guidance, "station": station, "difficulty": difficulty} | limits)
-        for task in GUIDANCE
-        for guidance in GUIDANCE[task]
-        for station in STATIONS
-        for difficulty in ("standard", "hard")
-        for limits in ({}, {"force_limit_range": (8.0, 25.0)})
-        if args.task in (None, task) and args.station in (None, station) and not (limits and difficulty == "standard")
-    ]
-    stops = total = 0
-    for task, options in cases:
-        result = run_case(task, max(args.steps // len(cases), 1), bounded_force=args.bounded == "true", **options)
-        stops += result["terminations"].get("collision", 0)
-        total += result["steps"]
-        print(json.dumps({"task": task, **options, **result}), flush=True)
-    print(json.dumps({"steps": total, "stops": stops}))
-    return 1 if stops else 0
+    cases = {(case.task, case.station, case.stiffness): case for case in read(args.out)}
+    for station in STATIONS:
+        for task, contacts in CONTACTS[station].items():
+            for stiffness in contacts:
+                if args.task in (None, task) and args.station in (None, station):
+                    cases.setdefault((task, station, stiffness), Case(task, station, stiffness))
+    table = list(cases.values())
+    searches: dict[int, dict[str, Search]] = {number: {} for number in range(len(table))}
+    steps = min(ROUND, max(args.steps // len(table), 1))
+    while (remaining := args.steps - sum(case.control_steps for case in table)) > 0:
+        number = min(range(len(table)), key=lambda index: table[index].control_steps)
+        run_round(table[number], searches[number], min(steps, remaining), args.bounded == "true")
+        if args.out is not None:
+            write(table, args.out)
+    for case in table:
+        print(", ".join(f"{name} {value}" for name, value in asdict(case).items()))
+    failed = sum(case.has_failed for case in table)
+    print(f"{sum(case.control_steps for case in table)} control steps, {failed} of {len(table)} cases failed")
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -58,17 +58,19 @@ HARDWARE = "packages/hardware"
 TEMPLATES = ["tests/models/templates"]
 TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
-    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "kernels", "kmp")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
     "models/templates/active_constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/parts.py": TEMPLATES,
     "models/control/command_filters.py": ["tests/models/control/test_keep_out.py"],
+    "models/control/wrench.py": ["tests/models/control/test_wrench.py"],
     "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/joint_status.py": [f"{HARDWARE}/tests/models/test_joint_status.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/message_sequence.py": [
         f"{HARDWARE}/tests/models/test_message_sequence.py"
     ],
+    f"{HARDWARE}/src/guiderail_hardware/models/round_trip.py": [f"{HARDWARE}/tests/models/test_round_trip.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/state_estimator.py": [
         f"{HARDWARE}/tests/models/test_state_estimator.py"
     ],
@@ -84,6 +86,9 @@ TARGETS = {
         for path in sorted((ROOT / HARDWARE / "src/guiderail_hardware/systems").glob("*.py"))
         if path.stem != "__init__"
     },
+    "packages/lerobot/src/guiderail_lerobot/chunk_safety_limiter.py": [
+        "packages/lerobot/tests/test_chunk_safety_limiter.py"
+    ],
     "systems/support/last_valid.py": [
         "tests/systems/test_command_watchdog.py",
         "tests/systems/test_energy_tank.py",
@@ -148,7 +153,9 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owne
                 setattr(owner, key, value)
         elif isinstance(value, CONSTANTS) and not np.array_equal(value, before):
             for user in list(sys.modules.values()):
-                if vars(user).get(key) is before and user.__name__.split(".")[0] in ("guiderail", *TEST_MODULES):
+                top = user.__name__.split(".")[0]
+                # The package or a sibling, such as guiderail_hardware, or a test.
+                if vars(user).get(key) is before and (top.startswith("guiderail") or top in TEST_MODULES):
                     setattr(user, key, value)
 
 

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from guiderail_hardware.models.round_trip import EXPIRY, WINDOW, RoundTrip, max_round_trip, to_microseconds
+from guiderail_hardware.models.round_trip import (
+    EXPIRY,
+    MAX_PENDING,
+    WINDOW,
+    RoundTrip,
+    max_round_trip,
+    to_microseconds,
+)
 
 PERIOD = 0.005
 
@@ -22,6 +29,20 @@ def run(latency, steps, round_trip=None, lost=()):
 @pytest.mark.parametrize("latency", [1, 2, 3, 12])
 def test_round_trip_is_the_time_from_command_to_report(latency):
     assert run(latency, latency + 30).seconds == pytest.approx(latency * PERIOD)
+
+
+def test_constants_have_their_documented_values():
+    assert (EXPIRY, MAX_PENDING, WINDOW) == (0.1, 400, 4)
+
+
+@pytest.mark.parametrize(("number", "is_known"), [(0, False), (1, True)])
+def test_only_the_newest_commands_are_awaited(number, is_known):
+    """The arrival of the command with this number is reported after one more than `MAX_PENDING` commands."""
+    round_trip, spacing = RoundTrip(), 1e-4
+    for step in range(401):
+        round_trip.add_command(step * spacing, step * spacing)
+    round_trip.update({to_microseconds(number * spacing)}, 401 * spacing)
+    assert np.isfinite(round_trip.seconds) == is_known
 
 
 def test_round_trip_is_unknown_without_a_report():
@@ -104,6 +125,22 @@ def test_loop_is_stable_at_the_bound_and_unstable_well_above(frequency, damping_
 def test_bound_keeps_the_margin_of_the_damping_of_a_stop():
     slow = np.array([0.1])
     assert max_round_trip(slow, 1.0, 0.02, period=PERIOD) == pytest.approx(0.02 * np.deg2rad(75.0) - 0.5 * PERIOD)
+
+
+@pytest.mark.parametrize("damping_ratio", [0.5, 0.6, 1.4])
+def test_bound_keeps_the_phase_margin_of_the_impedance(damping_ratio):
+    """The loop's phase at its crossover frequency, found by bisection, with the delay of the bound."""
+    natural, low, high = 20.0, 1.0, 1000.0
+    delay = max_round_trip(np.array([natural]), damping_ratio, 1.0, period=PERIOD) + 0.5 * PERIOD
+
+    def loop(frequency):
+        s = 1j * frequency
+        return (natural**2 + 2.0 * damping_ratio * natural * s) / s**2 * np.exp(-s * delay)
+
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if abs(loop(middle)) > 1.0 else (low, middle)
+    assert np.pi + np.angle(loop(low)) == pytest.approx(np.deg2rad(15.0), rel=1e-6)
 
 
 def test_bound_decreases_with_stiffness():

@@ -776,6 +776,29 @@ def test_joint_that_does_not_react_is_a_fault(joint):
     np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=0.5 * rig.v.max())
 
 
+@pytest.mark.parametrize(("speed", "is_adopted"), [(0.04, True), (0.5, False)])
+def test_robot_that_did_not_react_is_adopted_only_at_rest(speed, is_adopted):
+    """It may be another robot in the same posture, whose velocity would be damped after a pause."""
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    position, velocity = rig.q.copy(), np.array([speed, 0.0])
+
+    def other(true):
+        nonlocal position
+        position = position + PERIOD * velocity
+        return replace(true, positions=position, velocities=velocity + 1e-12 * (-1) ** rig.step)
+
+    frozen_status = rig.status()
+    rig.detected(lambda status: replace(frozen_status, time=status.time), torque=np.array([6.0, 0.0]))
+    rig.torque, rig.v = np.zeros(2), np.zeros(2)
+    position = rig.status().positions
+    for _ in range(round(0.9 * module.SOURCE_TIME / PERIOD)):
+        assert rig.check(other, torque=np.zeros(2))
+        assert np.abs(rig.estimate.state.velocity).max() < module.AGREEMENT
+    for _ in range(SETTLED + round(0.1 * module.SOURCE_TIME / PERIOD)):
+        rig.check(other, torque=np.zeros(2))
+    assert (rig.estimate.fault == Fault.NONE, rig.estimate.is_new) == (is_adopted, is_adopted)
+
+
 @pytest.mark.parametrize(("share", "is_fault"), [(0.95, False), (1.05, True)])
 def test_reaction_is_checked_at_its_tolerance(share, is_fault):
     """The limit of T |M⁻¹ τ| at constant τ is Δv_noise + T |M⁻¹| (tolerance + 0.3 |τ| + 0.1 |τ_external|)."""

@@ -344,6 +344,23 @@ def test_resume_is_refused_while_the_arm_moves(plant, speed, rest, is_refused):
         rig.system.resume(rig.context)
 
 
+def test_resume_is_refused_while_the_reported_speed_is_large(plant):
+    """The estimated velocity is zero while it is unknown; another robot reports its own."""
+    rig = Rig(plant)
+    rig.set(status_fault=[Fault.STALE])
+    rig.advance(LIMITS.damping_time + 1.0)
+    rest = np.zeros(n)
+    rig.set(velocity=rest, estimated_state=[*POSTURE, *rest], reported_speed=[0.151])
+    rig.advance(0.5)
+    rig.set(status_fault=[0.0])
+    rig.advance(2 * PERIOD)
+    with pytest.raises(InputError, match="it moves"):
+        rig.system.resume(rig.context)
+    rig.set(reported_speed=[0.149])
+    rig.advance(0.15 + 2 * PERIOD)
+    rig.system.resume(rig.context)
+
+
 def test_resume_is_refused_when_the_arm_is_not_stopped(plant):
     rig = Rig(plant)
     with pytest.raises(InputError, match="is running"):

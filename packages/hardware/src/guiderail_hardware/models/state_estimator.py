@@ -548,6 +548,8 @@ class StateEstimator:
             state = replace(state, fault=float(fault), fault_time=now)
         elif check_time - state.fault_time > self._limits.settling_time and not np.isfinite(state.source_time):
             state = replace(state, fault=float(Fault.NONE))
+        if fault == Fault.NOT_REACTING:  # another robot does not react to the torques, either
+            state = replace(state, source_time=now)
         if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
             state = replace(state, doubt_time=now)
         elif check_time - state.doubt_time > self._limits.settling_time:

@@ -307,7 +307,9 @@ class TorqueSafetyLimiter(LeafSystem):
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor, speed, is_refused])
         rest_time = context.get_discrete_state().value(self._rest_time).item() + self._period
-        discrete_state.set_value(self._rest_time, [rest_time if self._speed(context) <= REST_SPEED else 0.0])
+        # The estimated velocity is zero while it is unknown, for example while statuses are in doubt.
+        speed = np.fmax(self._speed(context), self._reported_speed_port.Eval(context)[0])
+        discrete_state.set_value(self._rest_time, [rest_time if speed <= REST_SPEED else 0.0])
 
     def _safe_torque(self, context: Context) -> np.ndarray:
         arm_state, _, _, blend_factor, *_ = self._state_of(context)
