@@ -47,9 +47,15 @@ def pytest_collection_modifyitems(items):
 FORKS = pytest.StashKey[Forks]()
 
 
+def pytest_collection(session):
+    """Pause garbage collections, each of which would traverse all modules that are imported so far."""
+    gc.disable()
+
+
 def pytest_collection_finish(session):
     """Start the fork servers after the imports of all tests and before the first fixture."""
     gc.freeze()  # excludes imported objects from garbage collections, which saves a fifteenth of the run time
+    gc.enable()
     used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
     # The server that starts later inherits the pipe of the earlier server and must end first.
     if "forkserver" in used:

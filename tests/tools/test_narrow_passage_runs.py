@@ -56,10 +56,14 @@ def test_run_resumes_bit_for_bit(trained, config, tmp_path):
     assert all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def test_evaluation_includes_the_demonstration_alone(trained):
-    result = evaluate(trained.path, episodes=2)
+def test_evaluation_includes_the_demonstration_and_saves_the_episodes(trained, tmp_path):
+    file = tmp_path / "saved.npz"
+    result = evaluate(trained.path, episodes=2, baselines=(), save=file)
     assert result["demonstration_success_rate"] == 1.0
     assert result["max_commanded_violation"] <= 1e-9
+    assert result["saved"] == 2
+    assert Demonstrations.load(file).num_demonstrations == 2
+    assert validate_demonstrations(file)["demonstrations"] == 2
 
 
 def test_held_out_starts_differ_and_follow_the_seed():
@@ -116,13 +120,6 @@ def test_video_is_an_animation_in_real_time(ending, recorded, trained, tmp_path,
             video.load()
             durations.append(video.info["duration"])
     assert abs(1e-3 * sum(durations) - 0.02 * row["steps"]) < 0.2 * 0.02 * row["steps"]
-
-
-def test_saved_episodes_can_be_used_as_demonstrations(trained, tmp_path):
-    file = tmp_path / "saved.npz"
-    assert evaluate(trained.path, episodes=2, save=file)["saved"] == 2
-    assert Demonstrations.load(file).num_demonstrations == 2
-    assert validate_demonstrations(file)["demonstrations"] == 2
 
 
 def test_tube_has_a_constant_radius():

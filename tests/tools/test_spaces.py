@@ -120,7 +120,8 @@ def test_model_with_dict_observations_is_evaluated(algorithm):
             return -np.linalg.norm(achieved - desired, axis=-1)
 
     env = Monitor(GoalEnv(spaces.Dict(dict.fromkeys(names, box)), box))
-    more = {"replay_buffer_class": stable_baselines3.HerReplayBuffer} if algorithm == "HER" else {}
+    more = {} if algorithm == "PPO" else {"buffer_size": 100}
+    more |= {"replay_buffer_class": stable_baselines3.HerReplayBuffer} if algorithm == "HER" else {}
     kind = getattr(stable_baselines3, "SAC" if algorithm == "HER" else algorithm)
     model = kind("MultiInputPolicy", env, device="cpu", **more)
     assert evaluate(model, env, 2, baselines=())["success_rate"] == 1.0

@@ -48,7 +48,7 @@ def test_summaries_tell_robots_apart_more_than_episodes(recorded):
 
 
 def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
-    # One recorded episode, and few draws of one episode each: more are simulated for coverage, which is not tested here.
+    # One recorded episode, and few draws of one episode each: more are for coverage, which is not tested here.
     first = min((recorded / "recordings").glob("*.parquet"))
     (recorded / "one").mkdir()
     shutil.copy(first, recorded / "one")

@@ -14,12 +14,12 @@ def test_one_policy_learns_in_both_engines_with_a_privileged_critic(tmp_path):
         "BncConnector", "kgrl", out=tmp_path / "run", variants={"drake": {}, "mujoco": {"station": "mujoco"}},
         settings={"net_arch": "8", "gradient_steps": 1, "learning_starts": 10, "batch_size": 8, "symmetry": "near",
                   "privileged_critic": True},
-        difficulty="hard", action_repeat=10, episodes=3, pictures=False,
+        difficulty="hard", action_repeat=10, episodes=2, pictures=False,
     )  # fmt: skip
     assert sorted(set(run.episodes["environment"])) == ["drake", "mujoco"]
     assert [member.environment["station"] for member in run.config.members] == ["gantry", "mujoco"]
-    guiderail.train(out=tmp_path / "run", episodes=4, resume=True, pictures=False)
-    assert len(run.episodes) == 4
+    guiderail.train(out=tmp_path / "run", episodes=3, resume=True, pictures=False)
+    assert len(run.episodes) == 3
 
 
 def test_privileged_observation_is_that_of_the_current_engine():

@@ -47,6 +47,12 @@ def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys, monke
     written = (out / "good" / "task.yaml").stat().st_mtime_ns
     shutil.copy(meshes / "good" / plug.name, plug)
     assert call() == first  # a stored failure is not repeated
+
+    def create(plug, socket, out, **options):
+        out.mkdir()
+        return {"inserted": True}
+
+    monkeypatch.setattr(batch, "create_task", create)  # only for the pair that failed
     arguments.append("--retry")
     assert call()["created"] == 2
     assert (out / "good" / "task.yaml").stat().st_mtime_ns == written

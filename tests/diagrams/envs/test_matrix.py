@@ -37,7 +37,7 @@ def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=0)
     assert not info["fallback"]
-    for _ in range(4):
+    for _ in range(2):
         *_, terminated, truncated, info = env.step(rng.uniform(-0.3, 0.3, env.action_space.shape))
         assert {"is_success", "termination", "control_steps", "fallback"} <= set(info)
         if terminated or truncated:

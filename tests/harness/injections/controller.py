@@ -16,7 +16,8 @@ from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 def main(url: str, rate: float) -> None:
     """Move the arm until the process is killed."""
-    station = HardwareStation(BncWorkcell(), robot_url=url, robot_timeout=60.0)
+    # The robot starts slowly on a busy machine.
+    station = HardwareStation(BncWorkcell(), robot_url=url, robot_timeout=600.0)
     clock = WallClock(station.driver, station.period, rate)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()

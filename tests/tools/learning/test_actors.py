@@ -38,10 +38,9 @@ def stop_in_episode_4(row):
         raise Stopped
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
-def test_run_with_actors_resumes_bit_for_bit(num_envs, parallel_config, tmp_path):
+def test_run_with_actors_resumes_bit_for_bit(parallel_config, tmp_path):
     """Episodes that are in simulation when the run stops are simulated again after the resume."""
-    config = parallel_config(num_envs)
+    config = parallel_config(3)
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)
     with pytest.raises(Stopped):

@@ -156,9 +156,8 @@ def test_finished_run_continues_with_more_episodes(bead_config, bead_run, tmp_pa
     assert extended.config() == bead_config
 
 
-@pytest.mark.parametrize("changes", [{}, {"num_envs": 2}], ids=str)
-@pytest.mark.parametrize("episodes", [4, 6])
-def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_config, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("episodes", "changes"), [(4, {}), (6, {}), (6, {"num_envs": 2})], ids=str)
+def test_interrupted_run_can_end_with_fewer_episodes(episodes, changes, bead_config, tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.tools.learning.trainer.MAX_SAVING_FRACTION", np.inf)  # a checkpoint per episode
     config = replace(bead_config, learner=replace(bead_config.learner, **changes))
     short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,8 +58,8 @@ def rate_distribution(successes: np.ndarray, numbers: np.ndarray) -> tuple[np.nd
     a = means[:, None] * concentrations
     b = (1.0 - means[:, None]) * concentrations
     logarithm = -0.5 * np.log(means * (1.0 - means))[:, None] + np.zeros_like(a)
-    for k, n in zip(successes, numbers, strict=True):
-        logarithm += betaln(a + k, b + n - k) - betaln(a, b)
+    for (k, n), draws in Counter(zip(successes.tolist(), numbers.tolist(), strict=True)).items():
+        logarithm += draws * (betaln(a + k, b + n - k) - betaln(a, b))
     weights = np.exp(logarithm - logarithm.max())
     weights /= weights.sum()
     edges = np.linspace(0.0, 1.0, _GRID + 1)

@@ -55,8 +55,9 @@ SCALE_WINDOW, MAX_EXCESS = (
 )  # decay time and largest share of statuses with a larger impulse than commanded [s]
 PULSE_WINDOW = 0.02  # decay time of the largest commanded impulse, longer than the delay of its effect [s]
 MAX_SCALE_ERROR = 0.35  # largest relative error of a torque in effect
-# Signs of another robot or clock on the channel. Afterwards a status is only accepted if the prediction explains it,
-# until for `SOURCE_TIME` [s] all statuses have come from one source, an arm at rest in the last accepted posture.
+# Signs of another robot or clock on the channel, besides a velocity that does not react. Afterwards a status is only
+# accepted if the prediction explains it, until for `SOURCE_TIME` [s] all statuses have come from one source, an arm at
+# rest in the last accepted posture.
 SOURCE_FAULTS = (Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.CONFLICT)
 SOURCE_TIME = 1.0
 SOURCE_SPEED, SOURCE_DISTANCE = 0.05, 0.1  # largest speed [rad/s], and distance from the accepted positions [rad]
@@ -197,10 +198,10 @@ class StateEstimator:
 
     The clocks are synchronized with the first status. Afterwards the clock offset follows early statuses quickly and
     late statuses slowly. After a fault or a timeout the clocks are synchronized again. After a sign of a second robot
-    (`SOURCE_FAULTS`), statuses are used again when they have come from one source for `SOURCE_TIME`, an arm at rest in
-    the last accepted posture. Delays of this program are not
-    attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`, and so is a jump of the local
-    clock that the robot's clock does not show. After a jump the velocity remains known.
+    (`SOURCE_FAULTS` or `NOT_REACTING`), statuses are used again when they have come from one source for `SOURCE_TIME`,
+    an arm at rest in the last accepted posture. Delays of this program are not attributed to the robot; a delay that is
+    too long is reported as `DEADLINE_MISSED`, and so is a jump of the local clock that the robot's clock does not show.
+    After a jump the velocity remains known.
 
     Args:
         limits: Plausibility limits of a status.
@@ -284,7 +285,10 @@ class StateEstimator:
             deviation = np.abs(values[self._velocities] - state.velocity)
             is_contradictory |= status.time - before.accepted_time > self._limits.max_age
         is_explained = (deviation <= explained).all()
-        fault = fault or self._find_contradiction(state, bool(is_contradictory and not is_explained))
+        if not fault:
+            fault = self._find_contradiction(state, bool(is_contradictory and not is_explained))
+            if fault == Fault.NOT_REACTING:  # another robot does not react to the torques, either
+                state = replace(state, source_time=now)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
         velocity = values[self._velocities]
@@ -393,7 +397,7 @@ class StateEstimator:
     ) -> tuple[EstimatorState, Fault]:
         """Return the state after a status that may be from another robot, and the fault.
 
-        After one of `SOURCE_FAULTS` the fault is repeated until the statuses have come from one source for
+        After a sign of another robot the fault is repeated until the statuses have come from one source for
         `SOURCE_TIME`. A robot at another posture, or in motion, is therefore never adopted.
         """
         if not (is_other or np.isfinite(state.source_time)):
@@ -548,8 +552,6 @@ class StateEstimator:
             state = replace(state, fault=float(fault), fault_time=now)
         elif check_time - state.fault_time > self._limits.settling_time and not np.isfinite(state.source_time):
             state = replace(state, fault=float(Fault.NONE))
-        if fault == Fault.NOT_REACTING:  # another robot does not react to the torques, either
-            state = replace(state, source_time=now)
         if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
             state = replace(state, doubt_time=now)
         elif check_time - state.doubt_time > self._limits.settling_time:
