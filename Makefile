@@ -26,7 +26,7 @@ test: $(VENV)/.ready  ## lint and all tests, at the same time: mypy uses one cor
 
 # Bytecode is cached, because the tests start many processes.
 tests: export PYTHONDONTWRITEBYTECODE =
-tests: $(VENV)/.ready
+tests: $(VENV)/.ready  ## all tests, without lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.ready  ## ruff and mypy
