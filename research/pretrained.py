@@ -6,6 +6,8 @@ The policies of contact tasks are learned at `difficulty="hard"` on the arm: the
 connector with a force-torque sensor at the wrist, because joint torques do not show the side of its rim. Every policy
 and the baseline policies of its task are evaluated on 40 held-out episodes. The policy's configuration, weights and
 evaluation are written to `tools/pretrained/NAME`. An interrupted training is resumed.
+
+`tools/pretrained/insertion` is `general-mean` of `research.unseen_parts`, which needs meshes of others.
 """
 
 from __future__ import annotations

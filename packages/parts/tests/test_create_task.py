@@ -688,6 +688,14 @@ def test_search_inserts_with_the_estimated_socket(folder):
     env.close()
 
 
+def test_general_policy_inserts_a_part_that_it_has_never_seen(folder, capsys):
+    arguments = ("--task", folder, "--difficulty", "hard", "--episodes", 3, "--baselines", "none", "--json")
+    call("evaluate", "pretrained:insertion", *arguments)
+    result = json.loads(capsys.readouterr().out)
+    assert result["successes"] >= 2
+    assert result["max_commanded_violation"] <= 1e-9
+
+
 def test_without_a_contact_map_the_socket_stays_uncertain(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "no_map")
     file = tmp_path / "no_map/task.yaml"
