@@ -692,7 +692,7 @@ def test_general_policy_inserts_a_part_that_it_has_never_seen(folder, capsys):
     arguments = ("--task", folder, "--difficulty", "hard", "--episodes", 3, "--baselines", "none", "--json")
     call("evaluate", "pretrained:insertion", *arguments)
     result = json.loads(capsys.readouterr().out)
-    assert result["successes"] >= 2
+    assert result["success_rate"] >= 0.6
     assert result["max_commanded_violation"] <= 1e-9
 
 
