@@ -161,8 +161,6 @@ def find_subject(
         if str(policy) in known_tasks() and not Path(policy).is_dir():
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
-        if (folder.path / "policy.json").is_file() and not (folder.path / "config.yaml").is_file():
-            raise InputError(f"{policy} is a policy without a run: name the task in which it acts (--task)")
         run_config = folder.config()
         run_config.refuse_changed_task(
             folder.path, "train again; with --task and --env its policy acts in the changed task"

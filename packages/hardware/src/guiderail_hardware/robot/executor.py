@@ -31,7 +31,7 @@ from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
 from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.files import check_writable, write_atomically
-from guiderail.tools.learning.run_folder import RunConfig
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail_hardware.drivers.clock import Clock, garbage_collection_disabled, set_realtime_priority
 from guiderail_hardware.drivers.driver import describe_stop
@@ -414,10 +414,15 @@ def configuration(run: Path, task: str | None) -> RunConfig:
     Raises:
         InputError: If there is no such run, policy or task, or the task of the run has changed.
     """
-    name, imports = (None, ()) if task is None else task_named(task)
-    config = find_subject(run, name).config
-    assert config is not None
-    return config if task is None else replace(config, imports=imports)
+    if task is None:
+        folder = RunFolder(find_run(run))
+        config = folder.config()
+        config.refuse_changed_task(folder.path)
+        return config
+    name, imports = task_named(task)
+    of_task = find_subject(run, name).config
+    assert of_task is not None
+    return replace(of_task, imports=imports)
 
 
 def recordings_folder(run: Path) -> Path:
