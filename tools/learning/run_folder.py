@@ -221,7 +221,7 @@ class RunFolder:
         except OSError as error:
             raise InputError(f"{brief(self.path)} cannot be read: {error.strerror}") from error
         if not is_run and (self.path / "policy.json").is_file():
-            raise InputError(f"{self.path} is a policy without a run: name the task in which it acts (--task)")
+            raise InputError(f"{self.path.name} is a policy without a run: name the task in which it acts (--task)")
         if not is_run:
             raise InputError(
                 f"{self.path} is not a run: it has no config.yaml; give a folder that guiderail train wrote"
