@@ -92,39 +92,21 @@ def deploy(
     its episodes; a stopped episode counts as a failure.
     """
     cli.import_files(imports)
-    connection, station, yes = robot.connect(robot.environment()), robot.station, robot.yes
+    connection = robot.connect(robot.environment())
+    where: dict[str, Any] = {"task": task, "station": robot.station, "assume_yes": robot.yes, "out": out}
     if episodes is not None:
         if force_limit is not None:
             raise InputError("an evaluation has the force limit of the training: leave --force-limit out")
         from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
 
-        result = evaluate_on_robot(
-            run,
-            connection,
-            episodes,
-            task=task,
-            station=station,
-            policy=policy,
-            assume_yes=yes,
-            out=out,
-            log=print_message,
-        )
+        result = evaluate_on_robot(run, connection, episodes, policy=policy, log=print_message, **where)
         print_result(result, as_json)
         return
     if policy is not None or as_json:
         raise InputError("--policy and --json belong to an evaluation: give --episodes too")
     from guiderail_hardware.robot.executor import deploy as deploy_policy
 
-    code = deploy_policy(
-        run,
-        connection,
-        task=task,
-        station=station,
-        force_limit=force_limit,
-        assume_yes=yes,
-        out=out,
-        log=print_progress,
-    )
+    code = deploy_policy(run, connection, force_limit=force_limit, log=print_progress, **where)
     raise typer.Exit(code)
 
 
