@@ -62,7 +62,7 @@ def test_guided_env_runs_without_extras():
     sys.path.insert(0, {str(Path(__file__).parent)!r})
     import numpy as np
     from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
-    from guiderail import GuidedEnv, GuidedVectorEnv
+    from guiderail import GuidedEnv
 
     env = GuidedEnv(
         PointEnv(), demonstrations=demonstrations(), frame=lambda env, o: env.unwrapped.target, pose=pose,

@@ -21,9 +21,6 @@ from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTra
 
 HISTORY_SOURCES = ("commanded", "measured")
 
-Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
-"""Primitive, and the arguments of its `predict`: step, null-space action (O,) and history (P, O)."""
-
 
 def predict(
     primitive: LcNsKmp,
@@ -32,7 +29,7 @@ def predict(
     history: np.ndarray | None,
     window: np.ndarray | None = None,
 ) -> np.ndarray | None:
-    """Return the output (O,) of a `Request`; None if no window within the constraints was found.
+    """Return the output (O,) of a primitive's `predict`; None if no window within the constraints was found.
 
     With a `window` ((H+1)(O + O²),), its means and covariances replace those of the reference.
     """
@@ -211,18 +208,12 @@ class PrimitiveLaw(Law):
             0, 0, primitive.constraints.nearest(primitive.reference.means[0]), history, filtered, is_slowed
         )
 
-    def request(self, state: PrimitiveState, action: np.ndarray) -> Request:
-        """Return the arguments of `predict` for an action (A,); with them, several episodes can form a batch."""
+    def command(self, state: PrimitiveState, action: np.ndarray, pose: np.ndarray, wrench: np.ndarray) -> Command:
+        """Return the command for an action (A,), a measured pose (O,) and a wrench (W,); see `Law.command`."""
         history = state.history if self.primitive.history else None
-        return self.primitive, state.step, self.gain * self._spread(action), history
-
-    def finish(self, state: PrimitiveState, action: np.ndarray, pose: np.ndarray, output: np.ndarray | None) -> Command:
-        """Return the command for a predicted output (O,), or for None if no output was found.
-
-        `action` is (A,), and `pose` (O,) is the measured pose.
-        """
-        desired, is_fallback = output_or_nearest(self.primitive.constraints, state.step, output, state.output)
-        output, filtered = desired, state.filtered
+        predicted = predict(self.primitive, state.step, self.gain * self._spread(action), history)
+        output, is_fallback = output_or_nearest(self.primitive.constraints, state.step, predicted, state.output)
+        desired, filtered = output, state.filtered
         if self.residual is not None:
             desired = desired + self.residual * self._spread(action)
         if self.clip is not None:
@@ -233,10 +224,6 @@ class PrimitiveLaw(Law):
             is_fallback = is_fallback or is_changed or state.is_slowed
         violation = self.checked.violation(desired, state.step)
         return Command(desired, violation, is_fallback, (output, filtered))
-
-    def command(self, state: PrimitiveState, action: np.ndarray, pose: np.ndarray, wrench: np.ndarray) -> Command:
-        """Return the command for an action (A,), a measured pose (O,) and a wrench (W,); see `Law.command`."""
-        return self.finish(state, action, pose, predict(*self.request(state, action)))
 
     def next(self, state: PrimitiveState, command: Command, pose: np.ndarray) -> PrimitiveState:
         """Return the state after a command, at a measured pose (O,); see `Law.next`."""

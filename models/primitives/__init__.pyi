@@ -13,6 +13,5 @@ from .poses import pose_rotation as pose_rotation
 from .promp import ProMp as ProMp
 from .qp import UnsolvableError as UnsolvableError
 from .reference import ReferenceTrajectory as ReferenceTrajectory
-from .window import BatchPrediction as BatchPrediction
 from .window import Modification as Modification
 from .window import Prediction as Prediction

@@ -26,7 +26,6 @@ from guiderail.models.primitives.kernels import Kernel, SquaredExponential, chec
 from guiderail.models.primitives.qp import UnsolvableError
 from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import (
-    BatchPrediction,
     Modification,
     Prediction,
     StepFactor,
@@ -136,35 +135,6 @@ class LcNsKmp:
         """
         factor = (self._cache.get(step) if type(step) is int else None) or self._factor(step)
         return self._finish(factor, self._stack(null_space_action, history))
-
-    def predict_batch(
-        self, steps: ArrayLike, null_space_actions: np.ndarray | None = None, histories: np.ndarray | None = None
-    ) -> BatchPrediction:
-        """Compute the outputs of B predictions at once, equal to those of `predict` up to rounding.
-
-        Predictions at the same step take two matrix products; a QP is solved only for those that violate a constraint.
-
-        Args:
-            steps: Steps n ≥ 0 (B,), or one step for all; past the end, the last step.
-            null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, with B from `histories` or `steps`.
-            histories: (B, P, O), as in `predict`; None if P = 0.
-        """
-        x, at = self._stack_batch(steps, null_space_actions, histories)
-        outputs = np.empty((len(x), self.num_outputs))
-        is_constrained, is_solved = np.zeros(len(x), dtype=bool), np.ones(len(x), dtype=bool)
-        order = np.argsort(at, kind="stable")
-        for rows in np.split(order, np.flatnonzero(np.diff(at[order])) + 1) if len(x) else ():
-            factor = self._factor(int(at[rows[0]]))
-            batch = x if len(rows) == len(x) else x[rows]
-            violates = ~factor.find_slack(batch)
-            outputs[slice(None) if batch is x else rows] = batch @ factor.output_map.T + factor.output_offset
-            for row in rows[violates]:
-                try:
-                    outputs[row] = self._finish(factor, x[row]).output
-                except UnsolvableError:
-                    outputs[row], is_solved[row] = np.nan, False
-            is_constrained[rows] = violates
-        return BatchPrediction(outputs, is_constrained, is_solved)
 
     def predict_window(
         self,
@@ -280,31 +250,6 @@ class LcNsKmp:
         if not math.isfinite(x.dot(x)):
             raise InputError("history and null-space action must be finite, also when squared")
         return x
-
-    def _stack_batch(
-        self, steps: ArrayLike, null_space_actions: np.ndarray | None, histories: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Check the arguments of a batch; return x (B, (P + 1) O) and the steps (B,), clipped to the last one."""
-        at = as_numbers(steps, "steps")
-        if at.ndim > 1 or not (at >= 0).all() or (at % 1 != 0).any():
-            raise InputError(f"steps are whole numbers, at least 0, one for each prediction, not {brief(steps)}")
-        actions = None if null_space_actions is None else as_doubles(null_space_actions, "null-space actions")
-        past = np.zeros(0) if histories is None else as_doubles(histories, "histories")
-        batched = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
-        size = len(batched[0]) if batched else at.size
-        if self.history == 0:
-            if past.size:
-                raise InputError("this primitive has no history (P = 0): pass None")
-        elif past.shape != (size, *self._history_shape):
-            raise InputError(f"histories have shape {(size, *self._history_shape)}, not {past.shape}")
-        x = np.zeros((size, (self.history + 1) * self.num_outputs))
-        if self.history:
-            x[:, : -self.num_outputs] = past.reshape(size, -1)
-        if actions is not None:
-            x[:, -self.num_outputs :] = actions
-        if not math.isfinite(np.vdot(x, x)):  # as in `_stack`; the sum of all squares is one reduction
-            raise InputError("histories and null-space actions must be finite, also when squared")
-        return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _checked_step(self, step: int) -> int:
         """Return a step, clipped to the last one; raise an InputError unless it is a whole number of at least 0."""

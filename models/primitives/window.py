@@ -137,7 +137,6 @@ def _pivoted_cholesky(A: np.ndarray) -> np.ndarray:
 
 # Smallest singular value of the unit constraint rows, relative to the largest; smaller values are rounding errors.
 _NEGLIGIBLE = 1e-13
-_CHUNK = 256  # number of predictions evaluated at a time, so that their constraints stay in the processor's cache
 _OPPOSITE = 4 * float(np.finfo(float).eps)  # largest entry of the sum of two unit rows that count as opposite
 
 
@@ -305,34 +304,6 @@ class StepFactor:
             loose = 0.5 * TOLERANCE * self._scale
             return solve_least_norm(self.constraint_rows, lower - loose, upper + loose)
 
-    def find_slack(self, x: np.ndarray) -> np.ndarray:
-        """Return a mask (B,), true where every constraint is slack for x (B, PO+O)."""
-        if len(x) < _CHUNK:
-            return self._is_inside(x)
-        # Single precision takes half the time. Bounds are tightened by the rounding error, and predictions that are not
-        # slack are evaluated again in double precision.
-        rounding = 2.0**-23 * (x.shape[1] + 4)
-        sizes = np.abs(self.constraint_map) @ np.maximum(x.max(axis=0), -x.min(axis=0))
-        finite = (np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (self.lower, self.upper))
-        near_lower, near_upper = (rounding * (sizes + size) for size in finite)
-        with np.errstate(over="ignore"):
-            lower, upper = (self.lower + near_lower).astype(np.float32), (self.upper - near_upper).astype(np.float32)
-        transposed = self.constraint_map.astype(np.float32).T
-        is_slack = np.empty(len(x), dtype=bool)
-        buffer = np.empty((min(_CHUNK, len(x)), len(lower)), dtype=np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinity count as not slack
-            for start in range(0, len(x), _CHUNK):
-                part = x[start : start + _CHUNK].astype(np.float32)
-                free = np.matmul(part, transposed, out=buffer[: len(part)])
-                is_slack[start : start + _CHUNK] = ((free >= lower) & (free <= upper)).all(axis=1)
-        undecided = np.flatnonzero(~is_slack)
-        is_slack[undecided] = self._is_inside(x[undecided])
-        return is_slack
-
-    def _is_inside(self, x: np.ndarray) -> np.ndarray:
-        free = x @ self.constraint_map.T
-        return np.asarray(((free >= self.lower) & (free <= self.upper)).all(axis=1))
-
     def output_sizes(self) -> np.ndarray:
         """Return the largest displacement (O,) of the executed point by a correction of norm one."""
         return np.linalg.norm(self._solve().L[: self._window.means.shape[1]], axis=1)
@@ -463,21 +434,6 @@ class Prediction:
     def trajectory(self) -> np.ndarray:
         """Modified window (H+1, O); computed at each access."""
         return self.factor.trajectory(self.x, self.correction)
-
-
-@dataclass(frozen=True)
-class BatchPrediction:
-    """Outputs of a primitive for several steps, actions and histories.
-
-    Attributes:
-        outputs: Outputs to execute (B, O), NaN where `is_solved` is false.
-        is_constrained: Mask (B,), true where the window violates a constraint without a correction.
-        is_solved: Mask (B,), false where no window within the constraints was found; repeat the last safe command.
-    """
-
-    outputs: np.ndarray
-    is_constrained: np.ndarray
-    is_solved: np.ndarray
 
 
 @dataclass(frozen=True)

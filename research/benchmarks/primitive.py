@@ -26,7 +26,6 @@ REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
 DENSE_SECONDS = 5.0  # time after which no further dense step is computed [s]
 STEPS = 20_000  # timed steps of each regime
 PERIOD = 0.02  # control period [s]
-BATCH = 4096  # predictions in a batch
 _MOTION = 400  # steps of the motion
 
 
@@ -270,29 +269,6 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
     return {"first_ms": 1e3 * first, "step_ms": 1e3 * seconds / p.num_steps, "step_kB": total / p.num_steps / 1e3}
 
 
-def _batch(size: tuple[int, int, int, int], repetitions: int = 20) -> dict[str, float]:
-    """Return the duration of a prediction in a batch at one step, and the largest difference from single predictions.
-
-    The constraints are slack.
-    """
-    p, rng = _primitive(size, REGIMES["slack"]), np.random.default_rng(0)
-    step = _MOTION // 2
-    gains = authority_gains(p)
-    actions = 0.1 * gains * rng.uniform(-1, 1, (BATCH, p.num_outputs))
-    histories = np.repeat(p.reference.means[None, step - p.history : step], BATCH, axis=0)
-    seconds = np.empty(repetitions)
-    for k in range(repetitions):
-        begin = time.perf_counter()
-        batch = p.predict_batch(step, actions, histories)
-        seconds[k] = time.perf_counter() - begin
-    one_by_one = [p.predict(step, actions[i], histories[i]).output for i in range(0, BATCH, 64)]
-    return {
-        "us": 1e6 * float(seconds.min()) / BATCH,
-        "constrained": float(batch.is_constrained.mean()),
-        "difference": float(np.abs(batch.outputs[::64] - one_by_one).max()),
-    }
-
-
 def measure(steps: int = STEPS) -> dict[str, Any]:
     """Run the benchmark; return the results by size."""
     report = {}
@@ -301,7 +277,6 @@ def measure(steps: int = STEPS) -> dict[str, Any]:
         report[name] = {
             "predict": _predict(size, steps),
             "leaf_system": _leaf_system(size, steps),
-            "batch": _batch(size),
             "factoring": _factoring(size),
             "solvers": _solvers(size),
         }
@@ -333,11 +308,6 @@ def show(report: dict[str, Any]) -> None:
             f"through the LeafSystem: median {leaf['median_us']:.0f} µs, p99 {leaf['p99_us']:.0f} µs; first prediction "
             f"{factoring['first_ms']:.1f} ms; factoring a step takes {factoring['step_ms']:.2f} ms and "
             f"{factoring['step_kB']:.0f} kB"
-        )
-        batch = parts["batch"]
-        console.print(
-            f"in a batch of {BATCH}: {batch['us']:.2f} µs each, {batch['constrained']:.0%} constrained, differs by "
-            f"{batch['difference']:.0e}"
         )
         for name, row in parts["solvers"].items():
             console.print(

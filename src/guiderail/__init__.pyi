@@ -61,7 +61,6 @@ from .tools.evaluation.evaluation import Evaluation as Evaluation
 from .tools.evaluation.rollout import rollout as rollout
 from .tools.guided.guide import Guide as Guide
 from .tools.guided.guided_env import GuidedEnv as GuidedEnv
-from .tools.guided.guided_env import GuidedVectorEnv as GuidedVectorEnv
 from .tools.guided.segment import Frame as Frame
 from .tools.guided.segment import Segment as Segment
 from .tools.guided.segment import cut_demonstrations as cut_demonstrations

@@ -19,7 +19,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws.law import Command, Law, check_law, safe_command
-from guiderail.models.laws.primitive import PrimitiveLaw, Request, predict
+from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
@@ -65,10 +65,10 @@ class Guide(ABC):
         """Begin with the commands of a law at a measured pose (O,), or after the last outputs (n, O)."""
         self._law, self._state, self._last, self._start = law, law.start(pose), None, pose
 
-    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
-        """Begin a control step; return the request for the prediction that `finish` needs, or None.
+    def command(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> tuple[Command, Any]:
+        """Return the command of a control step, in the world, and the discrete output for `to_action`.
 
-        Until `finish`, a second call begins the same control step again.
+        After an error of a function of the user, a second call begins the same control step again.
 
         Args:
             env: Environment, for the callables of segments and templates.
@@ -76,23 +76,12 @@ class Guide(ABC):
             action: Policy's action (A,), finite; the guide clips it to [−1, 1].
             pose: Measured pose (O,).
         """
-        self._action, self._pose = np.clip(action, -1.0, 1.0), pose
         last = self._last
         self._now = self._state if last is None else self._law.next(self._state, last, pose)
-        return self._law.request(self._now, self._action) if isinstance(self._law, PrimitiveLaw) else None
-
-    def finish(self, output: np.ndarray | None) -> tuple[Command, Any]:
-        """Complete the control step; return the command in the world and the discrete output for `to_action`.
-
-        `output` is the predicted output (O,), or None without a request or a solution.
-        """
         extra = self._extra()  # may call a function of the user, whose error must not skip a command
-        law, last = self._law, self._last
-        if isinstance(law, PrimitiveLaw):
-            command = law.finish(self._now, self._action, self._pose, output)
-        else:
-            returned = law.command(self._now, self._action, self._pose, np.zeros(0))
-            command = safe_command(returned, self._pose if last is None else last.pose)
+        returned = self._law.command(self._now, np.clip(action, -1.0, 1.0), pose, np.zeros(0))
+        is_primitive = isinstance(self._law, PrimitiveLaw)  # its commands are finite, in the segment's frame
+        command = returned if is_primitive else safe_command(returned, pose if last is None else last.pose)
         self._state, self._last = self._now, command
         return command, extra
 
@@ -305,8 +294,8 @@ class PrimitiveGuide(Guide):
         self._begin(law, past[-1] if primitive.history == 0 and motion_filter is None else np.array(past))
         self._last_output = past[-1]
 
-    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
-        """Begin a control step, and the next segment if the current one has ended."""
+    def command(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> tuple[Command, Any]:
+        """Return the command of a control step; begin the next segment if the current one has ended."""
         fitted = self.segments[self._index]
         segment = fitted.segment
         is_over = self._step >= fitted.num_steps + segment.dwell
@@ -316,11 +305,7 @@ class PrimitiveGuide(Guide):
             self._begin_segment(self._index + 1, env, observation)
         elif is_over:
             self._is_ended = True
-        return super().request(env, observation, action, pose)
-
-    def finish(self, output: np.ndarray | None) -> tuple[Command, Any]:
-        """Complete the control step; see `Guide.finish`."""
-        command, extra = super().finish(output)
+        command, extra = super().command(env, observation, action, pose)
         self._last_output = command.pose
         world = self.frame.to_world(command.pose, self._orientation)
         self._recent = [*self._recent, world][-max(self.settings.history, 2) :]
@@ -469,11 +454,6 @@ class LawGuide(Guide):
     def scaled_command(self) -> np.ndarray:
         """Return the last command (O,), which has no range to be scaled to."""
         return self._start if self._last is None else self._last.pose
-
-
-def predict_request(request: Request | None) -> np.ndarray | None:
-    """Return the output (O,) of a requested prediction; None if there is no request or it has no solution."""
-    return None if request is None else predict(*request)
 
 
 def _numbers(values: np.ndarray) -> str:

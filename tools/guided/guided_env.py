@@ -1,10 +1,8 @@
-"""Wrappers that add guidance to any Gymnasium environment: the action moves a demonstrated motion in constraints."""
+"""Wrapper that adds guidance to any Gymnasium environment: the action moves a demonstrated motion in constraints."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
 from numbers import Real
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -12,7 +10,6 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
@@ -27,7 +24,6 @@ from guiderail.tools.guided.guide import (
     LawGuide,
     PrimitiveGuide,
     TemplateGuide,
-    predict_request,
 )
 from guiderail.tools.guided.segment import Constraints, Segment
 from guiderail.tools.spaces import check_reset_result, check_step_result, check_values, naming_wrong_counts
@@ -188,98 +184,66 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Apply an action (A,) for `action_repeat` steps of the environment, or until the episode ends.
 
+        Entries of the action outside [−1, 1] are clipped. After an error in `to_action`, the next step repeats the
+        command and ignores the action.
+
         Raises:
             InputError: If the action is not (A,) finite numbers, in which case the environment is not stepped, or the
-                measured pose is not (O,) finite numbers.
-            ResetNeeded: If no episode has begun, or the episode has ended.
-        """
-        self.begin_action(action)
-        while not self.is_action_complete:
-            self.advance(predict_request(self.request()))
-        return self.end_action()
-
-    def begin_action(self, action: Any) -> None:
-        """Begin an action; `request`, `advance` and `end_action` apply it step by step, alongside other environments.
-
-        Raises:
-            InputError: If the action is not (A,) finite numbers; entries outside [−1, 1] are clipped.
+                measured pose is not (O,) finite numbers. If `to_action` returns an invalid action, in which case the
+                environment is not stepped, or the environment's step breaks Gymnasium's contract
+                (`check_step_result`). After an error of the environment's step, the episode cannot be continued.
             ResetNeeded: If no episode has begun, or the episode has ended.
         """
         if not self._has_begun:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
         if self._terminated or self._truncated:
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset() first")
-        checked = as_numbers(action, "an action")
-        if checked.shape != (self.guide.num_actions,) or not np.isfinite(checked).all():
+        action = as_numbers(action, "an action")
+        if action.shape != (self.guide.num_actions,) or not np.isfinite(action).all():
             raise InputError(f"an action must be {self.guide.num_actions} finite numbers, not {brief(action)}")
-        self._action, self._count, self._reward = checked, 0, 0.0
-        self._violation, self._fallbacks = -np.inf, 0
-        self._info: dict[str, Any] = {}
-        self._successes: dict[str, Any] = {}
-
-    @property
-    def is_action_complete(self) -> bool:
-        """True after the last step of an action, or the end of the episode."""
-        return self._count >= self.action_repeat or self._terminated or self._truncated
-
-    def request(self) -> Any:
-        """Return the request for the next step's prediction, or None if the step needs no prediction.
-
-        After an error in `to_action`, the next step repeats the command and ignores the action.
-
-        Raises:
-            InputError: If the measured pose is not (O,) finite numbers.
-        """
-        measured = self._measured()
-        return None if self._is_pending else self.guide.request(self.env, self._observation, self._action, measured)
-
-    def advance(self, output: np.ndarray | None) -> None:
-        """Step the environment with the predicted output (O,); None without a request or a solution.
-
-        Raises:
-            InputError: If `to_action` returns an invalid action, in which case the environment is not stepped, or the
-                environment's step breaks Gymnasium's contract (`check_step_result`). After an error of the
-                environment's step, the episode cannot be continued.
-        """
-        command = self._command
-        if command is None or not self._is_pending:
-            command, self._extra = self.guide.finish(output)
-            self._command = command
-        self._is_pending = True
-        action = self._to_action(self.env, self._observation, command.pose, self._extra)
-        self._check_action(action)
-        if self._is_checked:
-            check_values(self.env, self._observation, action)
-        self._has_begun = self._is_pending = False  # after an error below, the episode cannot be continued
-        with naming_wrong_counts():
-            result: Any = self.env.step(action)
-        result = check_step_result(self.env, result)
-        self._observation, reward, self._terminated, self._truncated, self._info = result
-        if self._is_checked:
-            check_values(self.env, self._observation)
-        self._has_begun = True
-        self._reward += reward
-        self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
-        self._fallbacks += command.fallback
-        self._successes |= {name: self._info[name] for name in SUCCESSES if np.any(self._info.get(name, False))}
-        self._count += 1
-        self._num_steps += 1
-        self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)
-
-    def end_action(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Return observation, summed reward, terminated, truncated and info, as `step` does."""
-        assert self._command is not None
+        reward, violation, fallbacks, info = 0.0, -np.inf, 0, {}
+        successes: dict[str, Any] = {}
+        for _ in range(self.action_repeat):
+            command = self._next_command(action)
+            own_action = self._to_action(self.env, self._observation, command.pose, self._extra)
+            self._check_action(own_action)
+            if self._is_checked:
+                check_values(self.env, self._observation, own_action)
+            self._has_begun = self._is_pending = False  # after an error below, the episode cannot be continued
+            with naming_wrong_counts():
+                result: Any = self.env.step(own_action)
+            result = check_step_result(self.env, result)
+            self._observation, step_reward, self._terminated, self._truncated, info = result
+            if self._is_checked:
+                check_values(self.env, self._observation)
+            self._has_begun = True
+            reward += step_reward
+            violation = float(np.maximum(violation, command.violation))  # NaN if one is NaN
+            fallbacks += command.fallback
+            successes |= {name: info[name] for name in SUCCESSES if np.any(info.get(name, False))}
+            self._num_steps += 1
+            self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)
+            if self._terminated or self._truncated:
+                break
         info = {
             "control_steps": self._num_steps,
-            **self._info,
-            **self._successes,
-            "constraint_violation": self._violation,
-            "fallback": self._fallbacks,
+            **info,
+            **successes,
+            "constraint_violation": violation,
+            "fallback": fallbacks,
             "phase": self.guide.phase,
-            "command": self._command.pose.copy(),
+            "command": command.pose.copy(),
             "segment": self.guide.segment_name,
         }
-        return self._extended(), self._reward, bool(self._terminated), bool(self._truncated), info
+        return self._extended(), reward, bool(self._terminated), bool(self._truncated), info
+
+    def _next_command(self, action: np.ndarray) -> Command:
+        """Return the command of the next step, or again the last one if an error prevented its step."""
+        measured = self._measured()
+        if self._command is None or not self._is_pending:
+            self._command, self._extra = self.guide.command(self.env, self._observation, action, measured)
+        self._is_pending = True
+        return self._command
 
     def _check_action(self, action: Any) -> None:
         """Raise an InputError if the result of `to_action` does not have the shape of an action, or is not finite."""
@@ -353,89 +317,3 @@ def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment
     if constraints is not None or frame is not None:
         raise InputError("give constraints and frame to each Segment")
     return list(demonstrations)
-
-
-class GuidedVectorEnv(SyncVectorEnv):
-    """Vector environment of `GuidedEnv`s that share fitted primitives; each behaves like a single `GuidedEnv`.
-
-    The primitives are fitted once. `LcNsKmp.predict_batch` computes the predictions of all environments in each step.
-    An environment is reset in the step after the end of its episode (`AutoresetMode.NEXT_STEP`).
-
-    Args:
-        env_fns: Functions that return the environments to wrap, at least one.
-        **keywords: Keywords of `GuidedEnv`.
-
-    Raises:
-        InputError: As `GuidedEnv`, or if two functions return the same environment.
-    """
-
-    def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
-        env_fns = list(env_fns)
-        first = GuidedEnv(env_fns[0](), **keywords)
-        own = {  # arguments that are not part of the shared guide
-            name: keywords[name]
-            for name in ("pose", "to_action", "action_repeat", "observe", "check_env")
-            if name in keywords
-        }
-
-        def wrap(make: Callable[[], gymnasium.Env[Any, Any]]) -> Callable[[], gymnasium.Env[Any, Any]]:
-            return lambda: GuidedEnv(make(), guidance=first.guide.copy(), **own)
-
-        super().__init__([lambda: first, *map(wrap, env_fns[1:])], autoreset_mode=AutoresetMode.NEXT_STEP)
-        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
-            raise InputError("each of env_fns must return an environment of its own: two of them return the same one")
-
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos.
-
-        Raises:
-            InputError: If the actions are not (B, A) finite numbers, in which case no environment is stepped, or a
-                measured pose is not (O,) finite numbers.
-            ResetNeeded: If no episode has begun.
-        """
-        actions = as_numbers(actions, "actions")
-        if actions.shape != self.action_space.shape:
-            raise InputError(f"actions must be of shape {self.action_space.shape}, not {actions.shape}")
-        if not np.isfinite(actions).all():
-            raise InputError(f"actions must be finite, not {brief(actions)}")
-        stepped = [i for i in range(self.num_envs) if not self._autoreset_envs[i]]
-        guided: list[Any] = [self.envs[i] for i in stepped]
-        for env, i in zip(guided, stepped, strict=True):
-            env.begin_action(actions[i])
-        while active := [env for env in guided if not env.is_action_complete]:
-            for env, output in zip(active, _predict_batch([env.request() for env in active]), strict=True):
-                env.advance(output)
-        results = {i: env.end_action() for env, i in zip(guided, stepped, strict=True)}
-        infos: dict[str, Any] = {}
-        for i, env in enumerate(self.envs):
-            if i in results:
-                self._env_obs[i], self._rewards[i], self._terminations[i], self._truncations[i], info = results[i]
-            else:
-                self._env_obs[i], info = env.reset()
-                self._rewards[i], self._terminations[i], self._truncations[i] = 0.0, False, False
-            infos = self._add_info(infos, info, i)
-        self._observations = gymnasium.vector.utils.concatenate(
-            self.single_observation_space, self._env_obs, self._observations
-        )
-        self._autoreset_envs = np.logical_or(self._terminations, self._truncations)
-        observations = deepcopy(self._observations) if self.copy else self._observations
-        return observations, np.copy(self._rewards), np.copy(self._terminations), np.copy(self._truncations), infos
-
-
-def _predict_batch(requests: list[Any]) -> list[np.ndarray | None]:
-    """Compute requested predictions, batched by primitive; an output is None without a request or a solution."""
-    groups: dict[int, list[int]] = defaultdict(list)
-    outputs: list[np.ndarray | None] = [None] * len(requests)
-    for i, request in enumerate(requests):
-        if request is not None:
-            groups[id(request[0])].append(i)
-    for rows in groups.values():
-        if len(rows) == 1:
-            outputs[rows[0]] = predict_request(requests[rows[0]])
-            continue
-        primitive, _, _, history = requests[rows[0]]
-        _, steps, raw, histories = zip(*(requests[i] for i in rows), strict=True)
-        batch = primitive.predict_batch(steps, np.array(raw), None if history is None else np.array(histories))
-        for i, output, is_solved in zip(rows, batch.outputs, batch.is_solved, strict=True):
-            outputs[i] = output if is_solved else None
-    return outputs

@@ -10,7 +10,7 @@ import pytest
 from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
 from scipy.spatial.transform import Rotation
 
-from guiderail import Demonstrations, Frame, GuidedEnv, GuidedVectorEnv, LinearConstraints, Segment
+from guiderail import Demonstrations, Frame, GuidedEnv, LinearConstraints, Segment
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraints
@@ -86,9 +86,9 @@ def test_commands_satisfy_the_constraints_for_any_actions(guidance, seed):
 @pytest.mark.parametrize("number", [0, 1])
 def test_violation_of_an_action_is_nan_if_a_command_has_nan(number, monkeypatch):
     env = make_guided()
-    finish, violations = env.guide.finish, iter([np.nan if k == number else -1.0 for k in range(3)])
+    command, violations = env.guide.command, iter([np.nan if k == number else -1.0 for k in range(3)])
     monkeypatch.setattr(
-        env.guide, "finish", lambda output: (finish(output)[0]._replace(violation=next(violations)), 0.0)
+        env.guide, "command", lambda *step: (command(*step)[0]._replace(violation=next(violations)), 0.0)
     )
     env.reset(seed=0)
     assert np.isnan(env.step(np.zeros(3))[-1]["constraint_violation"])
@@ -320,36 +320,6 @@ def test_invalid_pose_is_refused_at_reset(invalid):
         env.reset(seed=0)
 
 
-@pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "residual"])
-def test_vector_environment_equals_single_environments(guidance):
-    keywords = {
-        "demonstrations": RECORDED, "frame": at_target, "constraints": BOX, "pose": pose, "to_action": to_action,
-        "guidance": guidance, "period": PERIOD, "action_repeat": 2,
-    }  # fmt: skip
-    vector = GuidedVectorEnv([PointEnv] * 3, **keywords)
-    singles = [GuidedEnv(PointEnv(), **keywords) for _ in range(3)]
-    rng = np.random.default_rng(0)
-    observations, _ = vector.reset(seed=[3, 4, 5])
-    expected = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4, 5), strict=True)]
-    np.testing.assert_allclose(observations, expected, atol=1e-12)
-    done = [False] * 3
-    for _ in range(15):
-        actions = rng.uniform(-1, 1, (3, 3))
-        observations, rewards, terminated, truncated, infos = vector.step(actions)
-        for i, env in enumerate(singles):
-            if done[i]:
-                observation, _ = env.reset()
-                done[i] = False
-            else:
-                observation, reward, *ends, info = env.step(actions[i])
-                done[i] = any(ends)
-                assert rewards[i] == pytest.approx(reward, abs=1e-9)
-                assert [terminated[i], truncated[i]] == ends
-                assert infos["constraint_violation"][i] == pytest.approx(info["constraint_violation"], abs=1e-12)
-            np.testing.assert_allclose(observations[i], observation, atol=1e-6)
-    assert vector.single_action_space.shape == (3,)
-
-
 class PouringPointEnv(PointEnv):
     """Point environment that starts 0.34 m from the mug of the test."""
 
@@ -393,8 +363,7 @@ def test_scaled_command_of_a_template_is_in_its_frame():
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: {"mug_tip": X_WF}, 0.02)
     X_FE = pose_to_transform(np.array([-0.1, -0.2, 0.15, 0.3, 0.1, -0.2]))
     template_guide.reset(None, None, transform_to_pose(X_WF @ X_FE))
-    template_guide.request(None, None, np.zeros(3), np.zeros(6))
-    command = pose_to_transform(template_guide.finish(None)[0].pose)
+    command = pose_to_transform(template_guide.command(None, None, np.zeros(3), np.zeros(6))[0].pose)
     scaled = template_guide.scaled_command()
     np.testing.assert_allclose(
         scaled * [0.2, 0.2, 0.2, np.pi, np.pi, np.pi], transform_to_pose(X_WF.inverse() @ command)
@@ -434,20 +403,16 @@ class TransientSuccess(gymnasium.Wrapper):
         return *self.env.step(action)[:4], {"is_success": self.count == 4}
 
 
-@pytest.mark.parametrize("is_vector", [False, True])
-def test_success_inside_an_action_is_reported(is_vector):
+def test_success_inside_an_action_is_reported():
     keywords = {"demonstrations": RECORDED, "pose": pose, "to_action": to_action, "period": PERIOD, "action_repeat": 3}
     env = GuidedEnv(TransientSuccess(PointEnv()), **keywords)
-    if is_vector:
-        env = GuidedVectorEnv([lambda: TransientSuccess(PointEnv())] * 2, **keywords)
     env.reset(seed=0)
     infos = [env.step(np.zeros(env.action_space.shape))[-1] for _ in range(3)]
-    assert [bool(np.all(info["is_success"])) for info in infos] == [False, True, False]
-    assert [np.max(info["control_steps"]) for info in infos] == [3, 6, 9]
-    if not is_vector:
-        env = GuidedEnv(TransientSuccess(PointEnv()), **keywords)
-        row = rollout(env, lambda observation: np.zeros(3), seed=0)
-        assert (row["success"], row["steps"]) == (1, RECORDED.times[0].size)
+    assert [bool(info["is_success"]) for info in infos] == [False, True, False]
+    assert [info["control_steps"] for info in infos] == [3, 6, 9]
+    env = GuidedEnv(TransientSuccess(PointEnv()), **keywords)
+    row = rollout(env, lambda observation: np.zeros(3), seed=0)
+    assert (row["success"], row["steps"]) == (1, RECORDED.times[0].size)
 
 
 @pytest.mark.parametrize("reason", ["terminated", "truncated"])
@@ -576,8 +541,7 @@ def test_template_frames_may_be_drake_transforms():
     for X_WF in (RigidTransform([0.6, 0.0, 0.3]), drake.RigidTransform([0.6, 0.0, 0.3])):
         template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, o, X=X_WF: {"mug_tip": X}, 0.02)
         template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.1, 0.0, 0.0]))
-        template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
-        output = template_guide.finish(None)[0].pose
+        output = template_guide.command(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))[0].pose
         scaled.append(np.concatenate([output, template_guide.scaled_command()]))
     np.testing.assert_array_equal(*scaled)
 
