@@ -92,11 +92,13 @@ def template_of(config: EnvConfig) -> PlacedTemplate | None:
     return replace(placed, active_constraints=active)
 
 
+# With progress=state: deviation of position [m] and angles [rad] from the command beyond which the motion waits, and
+# largest total time for which it waits [s].
+PROGRESS_TOLERANCE, MAX_LAG = (0.0025, 0.1), 3.0
 _LIMITS = ("max_speed", "max_acceleration")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
 _CONVERTED_OPTIONS = (
-    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag",
-    "joint_margin", *_LIMITS,
+    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "joint_margin", *_LIMITS,
 )  # fmt: skip
 
 
@@ -105,8 +107,7 @@ def _state_progress(config: EnvConfig, period: float) -> StateProgress | None:
     options = config.parts["primitive"]
     if not isinstance(options, PrimitiveOptions) or options.progress == "clock":
         return None
-    position, angle = options.progress_tolerance
-    return StateProgress((position, angle), round(options.max_lag / period))
+    return StateProgress(PROGRESS_TOLERANCE, round(MAX_LAG / period))
 
 
 def _num_steps(config: EnvConfig, period: float) -> int:

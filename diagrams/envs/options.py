@@ -60,7 +60,6 @@ PRIMARY = {
     "history": "length",
     "kernel": "name",
     "net_arch": "units",
-    "progress": "mode",
     "sensing": "profile",
 }
 """Entry that a structured option sets if its value is no mapping: history=4 is history={length: 4}."""
@@ -140,8 +139,9 @@ def increases(lowest: float, highest: float, remedy: str) -> AfterValidator:
 
 Numbers = Annotated[tuple[Number, ...], BeforeValidator(_split_list)]
 Pair = Annotated[Numbers, Len(2, 2)]
-_positive = satisfies(lambda numbers: all(number > 0.0 for number in numbers), "give positive numbers")
-PositiveNumbers = Annotated[Numbers, _positive]
+PositiveNumbers = Annotated[
+    Numbers, satisfies(lambda numbers: all(number > 0.0 for number in numbers), "give positive numbers")
+]
 
 
 class CommonOptions(Options):
@@ -181,8 +181,6 @@ class PrimitiveOptions(Options):
         "history_variance": "history.variance",
         "history_source": "history.source",
         "adaptive_history": "history.adaptive",
-        "progress_tolerance": "progress.tolerance",
-        "max_lag": "progress.max_lag",
         "kernel_parameters": "kernel.parameters",
     }
 
@@ -233,11 +231,6 @@ class PrimitiveOptions(Options):
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: the motion waits for a robot that lags"
     )
-    progress_tolerance: Annotated[Pair, _positive] = Field(
-        (0.0025, 0.1),
-        description="deviation of position [m] and angles [rad] from the command beyond which the motion waits",
-    )
-    max_lag: Number = Field(3.0, ge=0, le=60, description="largest total time for which the motion waits [s]")
 
     @field_validator("kernel_parameters")
     @classmethod

@@ -180,8 +180,7 @@ class Disturbances(Options):
 
     entries: ClassVar[Mapping[str, str]] = entries_of(
         "sensing",
-        "wrench_scale", "wrench_bias", "wrench_drift", "wrench_noise", "wrench_delay", "calibration_error", "tare",
-        "pose_bias",
+        "wrench_scale", "wrench_bias", "wrench_noise", "wrench_delay", "calibration_error", "tare", "pose_bias",
     ) | entries_of(
         "disturbances",
         "friction_factor", "modulus_factor", "stiffness_factor", "lost_commands", "late_commands", "clock_factor",
@@ -204,9 +203,6 @@ class Disturbances(Options):
     )
     wrench_bias: Magnitudes | None = _sensor_error(
         "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
-    )
-    wrench_drift: Magnitudes | None = _sensor_error(
-        "random walk of the measured wrench, by its standard deviation after 10 s: force [N], torque [Nm]"
     )
     wrench_noise: Magnitudes | None = _sensor_error("standard deviation of the measured wrench: force [N], torque [Nm]")
     wrench_delay: Integer | None = Field(
@@ -234,7 +230,7 @@ class Disturbances(Options):
         """Errors of the sensors: errors of the setting `sensing`, replaced by the given options of single errors.
 
         Joint torques have separate errors. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
-        and the errors of the arm's model, `wrench_drift` their drift and friction, `wrench_noise` their noise.
+        and the errors of the arm's model, `wrench_noise` their noise.
         """
         errors = SENSING[self.sensing]
         given: dict[str, Any] = {
@@ -247,7 +243,6 @@ class Disturbances(Options):
             none = {
                 "wrench_scale": {"gain": 0.0},
                 "wrench_bias": {"offset": 0.0, "mass": 0.0, "center": 0.0, "payload": 0.0},
-                "wrench_drift": {"drift": 0.0, "friction": 0.0},
                 "wrench_noise": {"noise": 0.0},
             }
             for name, replaced in none.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import ObservationTerm, Observed
-from guiderail.diagrams.envs.options import Number, Pair, increases
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
@@ -34,12 +34,9 @@ from guiderail.models.objects.grid_clamp import (
 )
 from guiderail.models.templates import load_template
 
-START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
-HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
+# Smallest and largest start height [m]: the preceding skill ends with the pegs' tips 3 to 6 mm above the table.
+START_HEIGHT = (0.015, 0.018)
 NOMINAL = GridClampDimensions()
-StartHeight = Annotated[
-    Pair, increases(*HEIGHTS, f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
-]
 
 
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
@@ -260,7 +257,6 @@ class GridClamp(InsertionTask):
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offsets of table and clamp: sampled per run or per episode; none: clamp within 0.15 mm"
     )
-    start_height: StartHeight = Field(START_HEIGHT, description="smallest and largest start height [m]")
     force_limit: Number = force_limit_field(8)
     seconds: Number = Field(10.0, ge=2, le=30, description="duration of an episode [s]")
     hole_chamfer: Number = length_field(NOMINAL.hole_chamfer, 0.1 * MM, 0.8 * MM, "chamfer of the holes")
@@ -288,7 +284,7 @@ class GridClamp(InsertionTask):
 
     def prior(self) -> Prior:
         """Return a template with one state, an upright clamp in a cuboid around the middle hole, and a descent."""
-        heights = (max(self.start_height), -TEMPLATE.parameters["push_m"])
+        heights = (max(START_HEIGHT), -TEMPLATE.parameters["push_m"])
         return Prior(
             template=PlacedTemplate(TEMPLATE, {"hole": RigidTransform()}, max_tracking_error=MAX_TRACKING_ERROR),
             approach=ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2),
@@ -336,8 +332,8 @@ class GridClamp(InsertionTask):
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return a sampled start pose (6,) [m, rad], at which the preceding skill ends."""
-        start, (lowest, highest) = np.zeros(POSE_SIZE), self.start_height
-        start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
+        start = np.zeros(POSE_SIZE)
+        start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(*START_HEIGHT)
         return start
 
     def scene(self) -> Scene:

@@ -48,27 +48,25 @@ def make_template(
     config: PouringConfig,
     input_speed: float = 1.0,
     *,
+    aim: bool = False,
     shield: bool = False,
     pour_distance: float | None = None,
     funnel: bool = True,
-    **aiming: float,
 ) -> SharedControlTemplate:
     """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`.
 
-    `aiming` is empty, or `aim_speed` and `pour_speed`, fractions of the full speeds. If they are given, inputs can aim
-    the tip: in the state Pour, or with `shield` in a state before it. `pour_distance` (at which the state Pour begins,
-    [m]) and `funnel` are those of the template without aiming.
+    With `aim`, inputs can aim the tip: in the state Pour, or with `shield` in a state before it. `pour_distance` (at
+    which the state Pour begins, [m]) and `funnel` are those of the template without aiming.
     """
     changes = {} if pour_distance is None else {"near_m": pour_distance - config.mug.outer_radius}
     changes |= {} if funnel else {"funnel_m": NO_FUNNEL}
     return load_template(
-        ("pouring_shielded" if shield else "pouring_aimed") if aiming else "pouring",
-        **({} if aiming else changes),
+        ("pouring_shielded" if shield else "pouring_aimed") if aim else "pouring",
+        **({} if aim else changes),
         full_speed_m_per_s=input_speed * FULL_SPEED,
         full_tilt_rad_per_s=input_speed * FULL_TILT,
         mug_radius_m=config.mug.outer_radius,
         thermos_radius_m=config.thermos.outer_radius,
-        **aiming,
     )
 
 
@@ -327,8 +325,6 @@ class Pouring(Task):
     aim: bool = Field(
         False, description="let inputs aim the tip in the state Pour; observe the mug error and the template's state"
     )
-    aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
-    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilting speed in Pour, with aim")
 
     pour_distance: Number | None = Field(
         None, ge=0.06, le=0.2, description="distance of the tips at which the template pours, without aim [m]"
@@ -393,14 +389,13 @@ class Pouring(Task):
     def template(self) -> SharedControlTemplate:
         """Template of the thesis (figure 2.2, table 3.3), or the template with aiming in the state Pour."""
         speed = self.input_speed or (SPARSE_INPUT_SPEED if self.reward == "sparse" else 1.0)
-        aiming = {"aim_speed": self.aim_speed, "pour_speed": self.pour_speed} if self.aim else {}
         return make_template(
             self.workcell(),
             speed,
+            aim=self.aim,
             shield=self.shield,
             pour_distance=self.pour_distance,
             funnel=self.funnel,
-            **aiming,
         )
 
     def prior(self) -> Prior:

@@ -82,9 +82,7 @@ class StateProgress:
     """
 
     tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and the rotation [rad], positive
-    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (The option `max_lag`
-    # of an environment is a time in seconds.)
-    max_lag: int
+    max_lag: int  # largest number of steps behind the clock, not negative; with 0, progress follows the clock
 
     def __post_init__(self) -> None:
         if len(self.tolerance) != 2 or not all(0.0 < value < np.inf for value in self.tolerance):

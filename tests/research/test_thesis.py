@@ -69,16 +69,16 @@ def test_option_difference_is_described_with_both_values(changed, words):
 
 
 OTHER_VALUES = {
-    "offset_range": (0.0, 0.001), "start_height": (0.02, 0.03), "action_dims": (0,), "gains": (1.0, 1.0),
+    "offset_range": (0.0, 0.001), "action_dims": (0,), "gains": (1.0, 1.0),
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
     "time_step": 0.005, "control_period": 0.1, "disturbances.clock_factor": 2.0,
     "robot": "other.urdf", "end_effector": "other", "robot_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
     "force_limit_range": (12.0, 12.0), "sensing.wrench_scale": (0.5, 2.0),
-    "sensing.wrench_bias": (1.0, 0.1), "sensing.wrench_drift": (1.0, 0.1), "sensing.wrench_noise": (1.0, 0.1),
+    "sensing.wrench_bias": (1.0, 0.1), "sensing.wrench_noise": (1.0, 0.1),
     "sensing.wrench_delay": 3, "sensing.calibration_error": (0.001, 0.01), "sensing.tare": True,
     "max_speed": (0.1,), "max_acceleration": (1.0,), "joint_margin": 0.1,
-    "progress": "state", "progress.tolerance": (0.005, 0.2), "base_policy": "other", "base_policy.guard": "none",
+    "progress": "state", "base_policy": "other", "base_policy.guard": "none",
     "base_policy.max_jerk": (100.0,), "num_demonstrations": 1, "prior_std": (0.001, 0.001, 0.001, 0.01, 0.01, 0.01),
     "pour_distance": 0.09,
 }  # fmt: skip

@@ -37,7 +37,7 @@ def test_option_is_refused_when_out_of_range(task, option, value):
         ("BncConnector", {"sensing": "perfect"}, "there is no sensing 'perfect'"),
         ("BncConnector", {"sensing.calibration_error": (1.0, 0.0)}, "an error in meters and one in radians"),
         ("BncConnector", {"disturbances.friction_factor": (2.0, 1.0)}, "the smaller one first"),
-        ("GridClamp", {"start_height": (0.02, 0.01)}, "start_height cannot be .*the lower one first"),
+        ("BncConnector", {"offset_range": (0.002, 0.001)}, "offset_range cannot be .*the smaller one first"),
         ("GridClamp", {"reward": "dense"}, "there is no reward 'dense'"),
         ("NarrowPassage", {"obstacles_constrain": True, "second_obstacle": True}, "needs a single fixed obstacle"),
         ("NarrowPassage", {"observation": "images"}, "there is no observation 'images': did you mean image"),

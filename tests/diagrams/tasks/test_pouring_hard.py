@@ -68,7 +68,7 @@ def command_states(template, frames, actions, X_TP):
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
 def test_commands_satisfy_the_constraints_in_all_states(env, name):
     """The template without the simulated arm, for hundreds of control steps in all three states."""
-    template = make_template(env.diagram.task.workcell(), aim_speed=1.0, pour_speed=0.3)
+    template = make_template(env.diagram.task.workcell(), aim=True)
     frames = frames_of(template, RigidTransform([0.02, -0.01, 0.0]))
     start = template.project(template.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
     worst, reached = 0.0, set()
@@ -91,7 +91,7 @@ def test_commands_on_the_arm_satisfy_the_constraints():
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
     corners.on_episode_start()
     task = stepwise.diagram.task
-    template = make_template(task.workcell(), aim_speed=1.0, pour_speed=0.3)
+    template = make_template(task.workcell(), aim=True)
     _, info = stepwise.reset(seed=3)
     frames = frames_of(template, RigidTransform([*(info["mug_position"] + info["mug_error"]), 0.0]))
     for _ in range(60):

@@ -17,14 +17,13 @@ from guiderail.diagrams.tasks.pouring import (
     scripted_pour_from_above,
 )
 
-AIM_SPEEDS = {"aim_speed": 1.0, "pour_speed": 0.3}
 PERIOD = 0.01
 TOLERANCE = 1e-6
 
 
 @pytest.fixture(scope="module")
 def template():
-    return make_template(PouringConfig(), shield=True, **AIM_SPEEDS)
+    return make_template(PouringConfig(), aim=True, shield=True)
 
 
 def tilt_deg(X):
