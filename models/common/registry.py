@@ -27,7 +27,7 @@ GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor", "station:hardware"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark"),
+    "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark", "learner:ppo"),
     "data": ("dataset", "template"),
     "lerobot": ("learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy",
                 "guidance:kgrl_base_policy", "guidance:residual_base_policy"),
@@ -65,17 +65,13 @@ BUILT_IN = {
     "kernel:matern52": "guiderail.models.primitives.kernels:Matern52",
     "kernel:squared_exponential": "guiderail.models.primitives.kernels:SquaredExponential",
     "learner:crossq": f"{_LEARNING}.off_policy:CrossQLearner",
-    "learner:ppo": f"{_LEARNING}.on_policy:PpoLearner",
     "learner:sac": f"{_LEARNING}.off_policy:SacLearner",
     "learner:td3": f"{_LEARNING}.off_policy:Td3Learner",
     "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
-    "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
     "learner_config:crossq": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:ppo": f"{_LEARNING}.learner_config:PpoConfig",
     "learner_config:sac": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:td3": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:tqc": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:trpo": f"{_LEARNING}.learner_config:OnPolicyConfig",
 }
 """Plug-ins of this package: "module:attribute" by "kind:name"."""
 

@@ -71,7 +71,6 @@ LEARNER_CASES: dict[str, dict[str, Any]] = {
     "sac": OFF_POLICY,
     "td3": OFF_POLICY,
     "tqc": OFF_POLICY,
-    "trpo": ON_POLICY,
 }
 
 

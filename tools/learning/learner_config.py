@@ -117,30 +117,6 @@ class OffPolicyConfig(LearnerConfig):
             )
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class OnPolicyConfig(LearnerConfig):
-    """Settings of an on-policy learner, PPO or TRPO, by the names of Stable-Baselines3 where it has them."""
-
-    takes_images: ClassVar[bool] = False
-    entries: ClassVar[Mapping[str, str]] = {"gamma_per": "gamma.per"}
-
-    algorithm: str = "ppo"
-    learning_rate: Rate = 3e-4
-    gamma: Factor = 0.995  # discount factor per `gamma_per`
-    gamma_per: Literal["control_step", "action"] = "control_step"
-    n_steps: Annotated[Positive, Field(ge=2, le=10**6)] = 256  # transitions between two trainings
-    batch_size: BatchSize = 64  # transitions
-    net_arch: NetArch = (64, 64)  # units of the hidden layers
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class PpoConfig(OnPolicyConfig):
-    """Settings of proximal policy optimization (PPO)."""
-
-    n_epochs: Positive = 10  # passes through the transitions of a training
-    ent_coef: Fraction = 0.0  # weight of the entropy in the loss
-
-
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
 )  # table 4.1 of the thesis has no batch size and no buffer size; both are from table 3.2
@@ -196,9 +172,12 @@ PRESETS = {
 }
 
 
-def action_gamma(config: OffPolicyConfig | OnPolicyConfig, action_repeat: int) -> float:
-    """Return the discount factor of an action that lasts `action_repeat` control steps."""
-    return config.gamma**action_repeat if config.gamma_per == "control_step" else config.gamma
+def action_gamma(config: Any, action_repeat: int) -> float:
+    """Return the discount factor of an action that lasts `action_repeat` control steps.
+
+    `config` has the settings `gamma` and `gamma_per` of `OffPolicyConfig`.
+    """
+    return float(config.gamma**action_repeat if config.gamma_per == "control_step" else config.gamma)
 
 
 def resolve_preset(

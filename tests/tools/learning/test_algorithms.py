@@ -1,7 +1,6 @@
-"""TD3, CrossQ, PPO and TRPO; demonstrations in every batch; dropout of the critics."""
+"""TD3 and CrossQ; demonstrations in every batch; dropout of the critics."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,15 +10,13 @@ from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
+from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
 from guiderail.tools.learning.off_policy import TD3_NOISE
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
-ON_POLICY = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
-SETTINGS = {"td3": OFF_POLICY, "crossq": OFF_POLICY, "ppo": ON_POLICY, "trpo": ON_POLICY}
-ALGORITHMS = list(SETTINGS)
+ALGORITHMS = ["td3", "crossq"]
 OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
 
 
@@ -45,7 +42,7 @@ def learn(learner, episodes, rng, length=7):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
-    config = resolve_preset(None, algorithm, SETTINGS[algorithm])
+    config = resolve_preset(None, algorithm, OFF_POLICY)
     learner = make(config)
     before = learner.policy({"observation_shape": [3]})(OBSERVATION)
     rng = np.random.default_rng(0)
@@ -65,51 +62,18 @@ def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_exported_policy_acts_as_the_model(algorithm):
     """CrossQ's normalization by running statistics is part of the exported layers."""
-    config = resolve_preset(None, algorithm, SETTINGS[algorithm])
-    learner = make(replace(config, actor_ema=0.0) if hasattr(config, "actor_ema") else config)
+    config = resolve_preset(None, algorithm, OFF_POLICY)
+    learner = make(replace(config, actor_ema=0.0))
     learn(learner, 5, np.random.default_rng(0))
     expected = learner.model.predict(OBSERVATION, deterministic=True)[0]
     np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
 
 
 def test_td3_explores_with_noise():
-    learner = make(resolve_preset(None, "td3", SETTINGS["td3"]))
+    learner = make(resolve_preset(None, "td3", OFF_POLICY))
     actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
     np.testing.assert_allclose(actions.std(axis=0), TD3_NOISE, atol=0.02)
     assert np.abs(actions).max() <= 1.0
-
-
-def test_on_policy_settings_reach_the_algorithm():
-    ppo = make(make_config("ppo", {"n_epochs": 3, "n_steps": 32, "ent_coef": 0.1}))
-    assert (ppo.model.n_epochs, ppo.model.n_steps, ppo.model.ent_coef) == (3, 32, 0.1)
-    with pytest.raises(InputError, match="preset tqc_fast has settings that ppo does not have"):
-        resolve_preset("tqc_fast", "ppo")
-
-
-def test_on_policy_learner_bootstraps_a_time_limit():
-    """By hand: with γ = 1, the stored reward of a truncated step is its reward plus the next state's value."""
-    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "net_arch": "4"}))
-    next_observation = np.full(3, 0.5, np.float32)
-    value = float(learner._value(next_observation))
-    for truncated, terminated, expected in ((True, False, 2.0 + value), (False, True, 2.0)):
-        learner.on_episode_start()
-        action = learner.act(OBSERVATION)
-        learner.on_step(Transition(OBSERVATION, action, 2.0, next_observation, terminated, truncated, {}))
-        buffer = learner.model.rollout_buffer
-        assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
-
-
-def test_on_policy_learner_bootstraps_before_a_failed_simulation():
-    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 0.5, "net_arch": "4"}))
-    reached, failure = np.full(3, 0.5, np.float32), {"simulation_failure": "diverged"}
-    buffer = learner.model.rollout_buffer
-    for is_last, expected in ((False, 2.0 + 0.5 * float(learner._value(reached))), (True, 2.0)):
-        learner.on_episode_start()
-        learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 2.0, reached, is_last, False, {}))
-        if is_last:  # the next episode fails in its first step
-            learner.on_episode_start()
-        learner.on_step(Transition(reached, learner.act(reached), 0.0, reached, False, True, failure))
-        assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
 
 
 def make_with_demonstrations(fraction, **more_settings):
@@ -155,18 +119,6 @@ def test_demonstrations_that_fill_the_buffer_are_refused():
     assert learner.model.replay_buffer.num_demonstrated == 8
 
 
-def test_on_policy_learner_discards_the_action_before_a_failure():
-    learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
-    learner.on_episode_start()
-    failure = {"simulation_failure": "no solution"}
-    learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 0.0, OBSERVATION, False, True, failure))
-    assert learner.model.rollout_buffer.pos == 0
-    learner.on_episode_start()
-    correction = np.ones(2, np.float32)  # action of a supervisor, without a call of the learner's `act`
-    learner.on_step(Transition(OBSERVATION, correction, 0.0, OBSERVATION, False, False, {}))
-    assert learner.model.rollout_buffer.pos == 0
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -175,10 +127,6 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
-        *(
-            ({"algorithm": "ppo", name: 1}, f"ppo has no setting '{name}'")
-            for name in ("demonstration_episodes", "symmetry", "num_envs")
-        ),
     ],
 )
 def test_settings_that_exclude_each_other_are_named(settings, message):
@@ -215,14 +163,6 @@ def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
 def test_configuration_is_restored_from_its_values():
     values = config_values(resolve_preset(None, "td3"))
     assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")
-
-
-@pytest.mark.parametrize("algorithm", ["ppo", "trpo"])
-def test_images_are_refused_by_learners_without_image_encoder(algorithm):
-    learner = make_config(algorithm, {})
-    task = SimpleNamespace(observation_space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
-    with pytest.raises(InputError, match=f"{algorithm} takes no images"):
-        learner_arguments(SimpleNamespace(learner=learner), task)
 
 
 def test_probability_of_an_action_grows_over_base_motion_steps():

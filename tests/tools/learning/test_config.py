@@ -25,7 +25,7 @@ def test_config_refuses_values_out_of_range(setting, value):
 
 
 def test_learners_are_listed_without_importing_their_modules():
-    assert {*LEARNERS._packaged} == {"bc", "chunk", "crossq", "distillation", "ppo", "sac", "td3", "tqc", "trpo"}
+    assert {*LEARNERS._packaged} == {"bc", "chunk", "crossq", "distillation", "ppo", "sac", "td3", "tqc"}
 
 
 @pytest.mark.parametrize(("num_demonstrations", "is_warned"), [(0, False), (1, True), (99, True)])

@@ -1,16 +1,15 @@
-"""On-policy learners: PPO of Stable-Baselines3 and TRPO of sb3-contrib, trained by the libraries' own steps.
+"""Learner PPO of Stable-Baselines3, a method of the benchmark, trained by the library's own step.
 
 An update uses only the transitions since the last update. A checkpoint stores the transitions collected for the next
 update.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from torch.nn.utils import parameters_to_vector
@@ -19,31 +18,28 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import module_arrays, random_state, restore_modules, restore_random
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
-from guiderail.tools.learning.learner_config import OnPolicyConfig, PpoConfig, action_gamma
+from guiderail.tools.learning.learner_config import action_gamma
 from guiderail.tools.learning.networks import export_layers
+from guiderail_studies.ppo_config import PpoConfig
 
 _BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
 
 
-class OnPolicyLearner(Learner):
-    """Learner of an on-policy algorithm with the interface of Stable-Baselines3.
+@register_learner("ppo")
+class PpoLearner(Learner):
+    """Learner of proximal policy optimization (PPO; Schulman et al., 2017).
 
     Attributes:
-        algorithm: Class of the algorithm; a subclass sets it.
-        own_settings: Names of settings that the algorithm takes as arguments of the same name.
-        model: Instance of the algorithm.
+        model: PPO of Stable-Baselines3.
         transitions: Number of transitions so far.
     """
 
-    Config = OnPolicyConfig
-    algorithm: ClassVar[type]
-    own_settings: ClassVar[tuple[str, ...]] = ()
+    Config = PpoConfig
 
-    def __init__(self, config: OnPolicyConfig, env: gymnasium.Env, *, action_repeat: int, seed: int, **unused: Any):
+    def __init__(self, config: PpoConfig, env: gymnasium.Env, *, action_repeat: int, seed: int, **unused: Any):
         """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config = config
-        algorithm: Any = self.algorithm
-        self.model = algorithm(
+        self.model: Any = PPO(
             "MlpPolicy",
             env,
             learning_rate=config.learning_rate,
@@ -53,7 +49,8 @@ class OnPolicyLearner(Learner):
             policy_kwargs={"net_arch": list(config.net_arch)},
             seed=seed,
             device="cpu",
-            **{name: getattr(config, name) for name in self.own_settings},
+            n_epochs=config.n_epochs,
+            ent_coef=config.ent_coef,
         )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.model.policy.set_training_mode(False)
@@ -142,19 +139,3 @@ class OnPolicyLearner(Learner):
             getattr(buffer, name)[: buffer.pos] = arrays[f"buffer/{name}"]
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
         restore_random(arrays, values)
-
-
-@register_learner("ppo")
-class PpoLearner(OnPolicyLearner):
-    """Learner of proximal policy optimization (PPO; Schulman et al., 2017)."""
-
-    Config = PpoConfig
-    algorithm = PPO
-    own_settings = ("n_epochs", "ent_coef")
-
-
-@register_learner("trpo")
-class TrpoLearner(OnPolicyLearner):
-    """Learner of trust region policy optimization (TRPO; Schulman et al., 2015)."""
-
-    algorithm = TRPO
