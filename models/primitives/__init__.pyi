@@ -10,7 +10,6 @@ from .kmp import Kmp as Kmp
 from .lc_ns_kmp import LcNsKmp as LcNsKmp
 from .poses import pose_outputs as pose_outputs
 from .poses import pose_rotation as pose_rotation
-from .promp import ProMp as ProMp
 from .qp import UnsolvableError as UnsolvableError
 from .reference import ReferenceTrajectory as ReferenceTrajectory
 from .window import Modification as Modification

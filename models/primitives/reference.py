@@ -14,7 +14,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations, num_periods
 from guiderail.models.primitives.kernels import Kernel, check_kernel
 from guiderail.models.primitives.mixture import fit_mixture, regress, thinned
-from guiderail.models.primitives.promp import ProMp
 
 _SINGULAR = 1e-13  # largest eigenvalue of a correlation matrix that is singular in double precision
 VIA_POINT_VARIANCE = 1e-4  # variance of a via-point, relative to the kernel's; contradicting via-points are averaged
@@ -113,55 +112,12 @@ class ReferenceTrajectory:
             )
         demonstrations = demonstrations.resampled()
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
-        floor, at = _checked_floor(floor, outputs.shape[-1]), thinned(len(times), mixture_steps)
+        floor, at = checked_floor(floor, outputs.shape[-1]), thinned(len(times), mixture_steps)
         means, covariances = regress(fit_mixture(times[at], outputs[:, at], components, seed), times)
         covariances = covariances + np.diag(floor**2)
         if prior_std is not None:
             covariances += np.eye(len(floor)) * (interpolate_prior(prior_std, len(times), len(floor)) ** 2)[:, None]
         return cls(times, means, covariances)
-
-    @classmethod
-    def from_promp(cls, promp: ProMp, times: np.ndarray, floor: float | np.ndarray = 0.0) -> ReferenceTrajectory:
-        """Return the means and covariances of a probabilistic movement primitive.
-
-        Args:
-            promp: Primitive, with or without via-points (`ProMp.conditioned`).
-            times: Times (N,) of the phases from 0 to 1, strictly increasing [s].
-            floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
-        """
-        times = as_numbers(times, "times")
-        floor = _checked_floor(floor, promp.num_outputs)
-        means, covariances = promp.moments((times - times[0]) / (times[-1] - times[0]))
-        return cls(times, means, covariances + np.eye(promp.num_outputs) * np.square(floor))
-
-    def blended(self, other: ReferenceTrajectory, share: float | np.ndarray) -> ReferenceTrajectory:
-        """Blend two references by the normalized product of their Gaussians to the powers 1 − a and a.
-
-            Σ⁻¹ = (1 − a) Σ₁⁻¹ + a Σ₂⁻¹,    Σ⁻¹ μ = (1 − a) Σ₁⁻¹ μ₁ + a Σ₂⁻¹ μ₂
-
-        The reference of smaller covariance dominates (Paraschos et al., 2013).
-
-        Args:
-            other: Reference with the same times and outputs.
-            share: a in [0, 1], one number or (N,): 0 for this reference, 1 for `other`.
-
-        Raises:
-            InputError: If times or numbers of outputs differ, or the share is out of range.
-        """
-        if self.means.shape != other.means.shape or not np.allclose(self.times, other.times, rtol=0.0, atol=1e-9):
-            raise InputError("only references with the same times and outputs can be blended: resample one of them")
-        a = np.asarray(share, dtype=float)
-        if a.shape not in ((), (self.num_steps,)) or not ((a >= 0.0) & (a <= 1.0)).all():
-            raise InputError(f"the share of a blend is one number in [0, 1], or one for each of {self.num_steps} steps")
-        a = np.broadcast_to(a, self.num_steps)[:, None, None]
-        # With M = (1 − a) Σ₂ + a Σ₁ the covariance is Σ₁ M⁻¹ Σ₂ = Σ₂ M⁻¹ Σ₁, and a share of 0 or 1 is exact.
-        M = (1.0 - a) * other.covariances + a * self.covariances
-        first = np.linalg.solve(M, self.covariances).transpose(0, 2, 1)
-        second = np.linalg.solve(M, other.covariances).transpose(0, 2, 1)
-        means = (1.0 - a[..., 0]) * np.einsum("nop,np->no", second, self.means)
-        means += a[..., 0] * np.einsum("nop,np->no", first, other.means)
-        covariances = first @ other.covariances
-        return ReferenceTrajectory(self.times, means, (covariances + covariances.transpose(0, 2, 1)) / 2)
 
     @property
     def num_steps(self) -> int:
@@ -230,7 +186,7 @@ class ReferenceTrajectory:
             )
 
 
-def _checked_floor(floor: float | np.ndarray, num_outputs: int) -> np.ndarray:
+def checked_floor(floor: float | np.ndarray, num_outputs: int) -> np.ndarray:
     """Return a floor of standard deviations (O,)."""
     checked = as_numbers(floor, "floor")
     if checked.shape not in ((), (1,), (num_outputs,)) or not (np.isfinite(checked) & (checked >= 0)).all():

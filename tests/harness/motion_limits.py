@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # this file runs as a script
 
-from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail_hardware.drivers.fci import FciDriver
 from guiderail_hardware.drivers.rtde import UR_MOTION_LIMITS
+from guiderail_hardware.models.motion_limits import MotionLimits
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from oracles.franka import FRANKA_LIMITS
 

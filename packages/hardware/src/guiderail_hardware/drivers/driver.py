@@ -17,11 +17,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry, check_class
-from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import Robot, find_robot
 from guiderail_hardware.drivers.driver_guard import ERRORS, DriverGuard
 from guiderail_hardware.models.joint_status import Fault, Heartbeat, JointStatus, StatusLimits
+from guiderail_hardware.models.motion_limits import MotionLimits
 from guiderail_hardware.models.robot_impedance import RobotImpedance
 from guiderail_hardware.systems.torque_safety_limiter import SafetyLimits
 

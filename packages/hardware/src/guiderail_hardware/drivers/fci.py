@@ -17,9 +17,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError, import_extra
-from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail_hardware.drivers.driver import Check, PoseDriver, register_driver
 from guiderail_hardware.models.joint_status import MALFORMED_STATUS, JointStatus
+from guiderail_hardware.models.motion_limits import MotionLimits
 from guiderail_hardware.models.robot_impedance import RobotImpedance
 
 logger = logging.getLogger(__name__)

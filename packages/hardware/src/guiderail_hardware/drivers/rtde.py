@@ -20,13 +20,13 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError, import_extra
-from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.inverse_kinematics import pose_error
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
 from guiderail.systems.support.drake_multibody import transform_to_vector
 from guiderail_hardware.drivers.driver import Check, PoseDriver, register_driver
 from guiderail_hardware.models.joint_status import MALFORMED_STATUS, JointStatus
+from guiderail_hardware.models.motion_limits import MotionLimits
 from guiderail_hardware.models.robot_impedance import RobotImpedance
 
 logger = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail_hardware.models.motion_limits import MotionLimits
 
 # Modes in order of preference: synchronized axes, independent axes, braking to rest. For numerical reasons, the axes
 # cannot be synchronized for about one of 10,000 adversarial commands.

@@ -1,4 +1,7 @@
-"""Probabilistic movement primitive: a Gaussian over weights of basis functions (Paraschos et al., NeurIPS 2013)."""
+"""Probabilistic movement primitive: a Gaussian over weights of basis functions (Paraschos et al., NeurIPS 2013).
+
+It describes the same demonstrations as the Gaussian mixture of `ReferenceTrajectory.from_demonstrations`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ import numpy as np
 
 from guiderail.models.common.arrays import as_numbers, as_whole, find_asymmetric
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail.models.primitives.reference import checked_floor
 
 NUM_BASIS = 60  # default number of basis functions for motions of at least four times as many steps
 RIDGE = 1e-8  # regularization of the weights, relative to the largest eigenvalue of the features
@@ -99,12 +103,55 @@ class ProMp:
         covariances = blocks @ self.covariance @ blocks.transpose(0, 2, 1) + self.noise
         return blocks @ self.mean, (covariances + covariances.transpose(0, 2, 1)) / 2
 
+    def reference(self, times: np.ndarray, floor: float | np.ndarray = 0.0) -> ReferenceTrajectory:
+        """Return the reference trajectory of the means and covariances, with or without via-points.
+
+        Args:
+            times: Times (N,) of the phases from 0 to 1, strictly increasing [s].
+            floor: Standard deviation, (O,) or scalar, as in `ReferenceTrajectory.from_demonstrations`.
+        """
+        times = as_numbers(times, "times")
+        floor = checked_floor(floor, self.num_outputs)
+        means, covariances = self.moments((times - times[0]) / (times[-1] - times[0]))
+        return ReferenceTrajectory(times, means, covariances + np.eye(self.num_outputs) * np.square(floor))
+
     def _blocks(self, phases: np.ndarray) -> np.ndarray:
         """Return I ⊗ φ(s)ᵀ at phases (n,), (n, O, O·K)."""
         count = len(self.mean) // self.num_outputs
         features = _features(phases, count)
         blocks = np.einsum("op,nk->nopk", np.eye(self.num_outputs), features)
         return blocks.reshape(len(features), self.num_outputs, -1)
+
+
+def blend(first: ReferenceTrajectory, second: ReferenceTrajectory, share: float | np.ndarray) -> ReferenceTrajectory:
+    """Blend two references by the normalized product of their Gaussians to the powers 1 − a and a.
+
+        Σ⁻¹ = (1 − a) Σ₁⁻¹ + a Σ₂⁻¹,    Σ⁻¹ μ = (1 − a) Σ₁⁻¹ μ₁ + a Σ₂⁻¹ μ₂
+
+    The reference of smaller covariance dominates (Paraschos et al., 2013).
+
+    Args:
+        first: Reference.
+        second: Reference with the same times and outputs.
+        share: a in [0, 1], one number or (N,): 0 for the first reference, 1 for the second.
+
+    Raises:
+        InputError: If times or numbers of outputs differ, or the share is out of range.
+    """
+    if first.means.shape != second.means.shape or not np.allclose(first.times, second.times, rtol=0.0, atol=1e-9):
+        raise InputError("only references with the same times and outputs can be blended: resample one of them")
+    a = np.asarray(share, dtype=float)
+    if a.shape not in ((), (first.num_steps,)) or not ((a >= 0.0) & (a <= 1.0)).all():
+        raise InputError(f"the share of a blend is one number in [0, 1], or one for each of {first.num_steps} steps")
+    a = np.broadcast_to(a, first.num_steps)[:, None, None]
+    # With M = (1 − a) Σ₂ + a Σ₁ the covariance is Σ₁ M⁻¹ Σ₂ = Σ₂ M⁻¹ Σ₁, and a share of 0 or 1 is exact.
+    M = (1.0 - a) * second.covariances + a * first.covariances
+    from_first = np.linalg.solve(M, first.covariances).transpose(0, 2, 1)
+    from_second = np.linalg.solve(M, second.covariances).transpose(0, 2, 1)
+    means = (1.0 - a[..., 0]) * np.einsum("nop,np->no", from_second, first.means)
+    means += a[..., 0] * np.einsum("nop,np->no", from_first, second.means)
+    covariances = from_first @ second.covariances
+    return ReferenceTrajectory(first.times, means, (covariances + covariances.transpose(0, 2, 1)) / 2)
 
 
 def _features(phases: np.ndarray, count: int) -> np.ndarray:

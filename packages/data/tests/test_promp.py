@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations, ProMp, ReferenceTrajectory
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail_data.promp import ProMp, blend
 
 T = np.linspace(0.0, 2.0, 100)
 PHASES = np.linspace(0.0, 1.0, 100)
@@ -77,12 +78,12 @@ def test_promp_refuses_too_many_basis_functions():
 def test_reference_from_promp_has_its_moments_and_a_floor():
     promp = ProMp.fit(bundle())
     means, covariances = promp.moments(PHASES)
-    reference = ReferenceTrajectory.from_promp(promp, T, floor=[0.01, 0.02])
+    reference = promp.reference(T, floor=[0.01, 0.02])
     np.testing.assert_allclose(reference.means, means, atol=1e-12)
     np.testing.assert_allclose(reference.covariances, covariances + np.diag([1e-4, 4e-4]), atol=1e-12)
     for floor in (-0.01, [0.01, np.nan], [0.01] * 3):
         with pytest.raises(InputError, match="floor"):
-            ReferenceTrajectory.from_promp(promp, T, floor=floor)
+            promp.reference(T, floor=floor)
 
 
 def random_reference(scale, seed):
@@ -95,7 +96,7 @@ def random_reference(scale, seed):
 
 def test_blend_is_the_product_of_the_gaussians():
     first, second, share = random_reference(1.0, 0), random_reference(0.1, 1), np.linspace(0.05, 0.95, 100)
-    blended = first.blended(second, share)
+    blended = blend(first, second, share)
     precisions = [np.linalg.inv(reference.covariances) for reference in (first, second)]
     precision = (1.0 - share)[:, None, None] * precisions[0] + share[:, None, None] * precisions[1]
     both = [
@@ -109,10 +110,10 @@ def test_blend_is_the_product_of_the_gaussians():
 def test_blend_of_share_zero_and_one_is_exact():
     first, second = random_reference(1.0, 0), random_reference(0.1, 1)
     for share, expected in ((0.0, first), (1.0, second)):
-        np.testing.assert_allclose(first.blended(second, share).means, expected.means, rtol=1e-9)
-        np.testing.assert_allclose(first.blended(second, share).covariances, expected.covariances, rtol=1e-9)
+        np.testing.assert_allclose(blend(first, second, share).means, expected.means, rtol=1e-9)
+        np.testing.assert_allclose(blend(first, second, share).covariances, expected.covariances, rtol=1e-9)
     for share in (-0.1, np.nan, np.zeros(3)):
         with pytest.raises(InputError, match="share"):
-            first.blended(second, share)
+            blend(first, second, share)
     with pytest.raises(InputError, match="same times"):
-        first.blended(ReferenceTrajectory(2.0 * T, first.means, first.covariances), 0.5)
+        blend(first, ReferenceTrajectory(2.0 * T, first.means, first.covariances), 0.5)
