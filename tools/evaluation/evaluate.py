@@ -242,7 +242,6 @@ def evaluate(
     save: Path | str | None = None,
     signal: str = "commanded",
     steps: Path | str | None = None,
-    describe_differences: Callable[[RunConfig], Sequence[str]] | None = None,
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
@@ -277,7 +276,6 @@ def evaluate(
             commanded poses, because their difference from the measured poses causes the contact force.
         steps: Folder to write the policy's step log into, with one row for each control step, in a set one folder for
             each environment; it must not exist. The log of an ensemble has the column `disagreement`.
-        describe_differences: Function from a configuration to sentences on how it differs from a reference.
 
     Returns:
         Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, the
@@ -286,9 +284,8 @@ def evaluate(
         `skipped_baselines`, those that do not fit the environment's observation or action; `best_baseline` and `p`, the
         largest of the one-sided p-values against each baseline policy, if there is a `Comparison`; `episodes` and
         `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run; `saved`, the
-        number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is given. In a set,
-        the statistics are those of all episodes, whose rows have the column `environment`, and `environments` has the
-        success rate of each policy in each environment.
+        number of saved demonstrations, if `save` is given. In a set, the statistics are those of all episodes, whose
+        rows have the column `environment`, and `environments` has the success rate of each policy in each environment.
         `collisions` and `collision_steps` are None if the task declares no collision signal.
 
     Raises:
@@ -300,7 +297,6 @@ def evaluate(
     options = _Options(
         check_num_episodes(episodes), check_seed(seed), check_processes(processes), baselines, environment or {},
         resample_offsets, None if save is None else Path(save), signal, None if steps is None else Path(steps),
-        describe_differences,
     )  # fmt: skip
     options.check_files()
     envs: list[Any] = list(env) if isinstance(env, list | tuple) else [env]
@@ -338,7 +334,6 @@ class _Options:
     save: Path | None
     signal: str
     steps: Path | None
-    describe_differences: Callable[[RunConfig], Sequence[str]] | None
 
     def check_files(self) -> None:
         """Raise an InputError if the step log or demonstrations cannot be written."""
@@ -467,8 +462,6 @@ def _evaluate_subject(subject: Subject, env: Any, is_given: bool, options: _Opti
         result |= {"best_baseline": comparison.baseline, "p": comparison.p}
     if save is not None:
         result["saved"] = _save_demonstrations(motions, save)
-    if options.describe_differences is not None and config is not None:
-        result["differences"] = list(options.describe_differences(replace(config, environment=environment)))
     return Evaluation(result, rows_of, is_held_out=config is not None)
 
 

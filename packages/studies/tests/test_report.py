@@ -76,16 +76,8 @@ def test_report_of_a_study_is_one_self_contained_page(study_folder, tmp_path):
     assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "successes and interval of each seed"
     assert "58.4%" not in text, "no interval of all seeds, because the episodes of a seed are not independent"
     assert "no action: zero" in text
-    assert "Differs from the thesis in" not in text
     assert "guiderail study beads.yaml --out studies" in text
     assert RunFolder(study_folder / "kmp-1").config().versions["drake"] in text
-
-
-def test_report_states_differences_when_asked(study_folder, tmp_path):
-    page = tmp_path / "report.html"
-    write_report([study_folder], page, describe_differences=lambda config: ["the task", config.environment["guidance"]])
-    assert "Differs from the thesis in the task" in text_of(page.read_text())
-    assert "demonstration alone also in kmp" in text_of(page.read_text())
 
 
 def test_methods_are_named_after_differing_settings(study_folder):

@@ -24,7 +24,6 @@ from guiderail_studies.study import (
     NEVER,
     _pooled_success,
     breaking_point,
-    differences_by_method,
     draw_sweeps,
     each,
     method_rows,
@@ -33,7 +32,6 @@ from guiderail_studies.study import (
     study_command,
 )
 from research.studies import study_path
-from research.thesis import describe_differences
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
@@ -303,22 +301,6 @@ def test_studies_in_one_folder_have_separate_files(tmp_path):
     assert modification_times(out) == before
 
 
-def test_differences_are_grouped_by_method():
-    study = load_study(study_path("connector_hard")).subset(["kgrl", "skgrl", "uniform_random", "scripted"])
-    groups = differences_by_method(study, describe_differences)
-    assert "reward aligned (thesis: sparse)" in groups["all methods"]
-    assert any(sentence.startswith("difficulty 'hard', added here") for sentence in groups["all methods"])
-    assert any("checkpoint selection" in sentence for sentence in groups["kgrl"])
-    assert any("ρ" in sentence for sentence in groups["skgrl"])
-    for method, declaration in study.methods.items():
-        own = [text for methods, texts in groups.items() if method in methods.split(", ") for text in texts]
-        config = Job(study, method, study.seeds[0], Path()).config(60)
-        learns = declaration.policy == "learned"
-        expected = describe_differences(config, learns=learns)
-        assert sorted([*groups["all methods"], *own]) == sorted(expected)
-        assert any("checkpoint selection" in sentence for sentence in expected) == learns
-
-
 def test_breaking_point_is_interpolated():
     assert breaking_point([1.0, 2.0, 3.0], [1.0, 1.0, 0.8]) == pytest.approx(2.5)
     assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
@@ -397,14 +379,11 @@ def test_study_command_summarizes_each_seed(tmp_path, capsys):
     study = make_study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
     result = study_command(study, tmp_path, make_engine(processes=1), file=Path("first.yaml"))
     assert json.loads(source_file(tmp_path, study.name).read_text())["file"] == "first.yaml"
-    described = study_command(study, tmp_path, describe_differences=lambda config, *, learns=True: [config.task])
-    assert described["differences"] == {"all methods": ["Bead"]}
     rows = read_table(tmp_path / "beads.csv")
     assert len(rows) == 2
     rates = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == rates
     assert result["mean return of learner as a fraction of learner's, each seed"] == "1.00, 1.00"
-    assert "differences" not in result
     header, _, row = (tmp_path / "beads.md").read_text().splitlines()  # one method, with two seeds
     assert header.count("|") == 13
     assert row.startswith("| learner | 2 | 2 | held out | 3 |")

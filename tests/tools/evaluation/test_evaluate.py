@@ -167,12 +167,6 @@ def test_evaluate_saves_successful_episodes(tmp_path):
         evaluate("zero", "NarrowPassage", save=tmp_path / "other.npz", signal="wrench")
 
 
-def test_evaluate_describes_differences_when_asked(bead_run):
-    assert "differences" not in evaluate(bead_run, episodes=1)
-    result = evaluate(bead_run, episodes=1, describe_differences=lambda config: [config.task])
-    assert result["differences"] == ["Bead"]
-
-
 def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
     def evaluate_in(processes):
         return evaluate(

@@ -24,7 +24,6 @@ from guiderail.tools.evaluation.metrics import (
     wilson,
 )
 from guiderail.tools.files import check_page, write_atomically
-from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
 from guiderail.tools.visualization.figures import WINDOW, legend_above, new_figure, rolling
 from guiderail_studies.report_data import LEARNED, ReportData, Run, command, flat, gather
@@ -34,7 +33,6 @@ PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
 )
 UNCONSTRAINED = -1e20  # a violation below this value means that there is no constraint
-DescribeDifferences = Callable[[RunConfig], Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -61,13 +59,10 @@ class Table:
     rows: Sequence[Row]
 
 
-def write_report(
-    paths: Sequence[Path], out: Path, *, episodes: int = 0, describe_differences: DescribeDifferences | None = None
-) -> Path:
+def write_report(paths: Sequence[Path], out: Path, *, episodes: int = 0) -> Path:
     """Write the report of runs and studies as an HTML file.
 
-    Runs are evaluated on `episodes` held-out episodes; see `gather`. `describe_differences` returns sentences on how a
-    configuration differs from a reference.
+    Runs are evaluated on `episodes` held-out episodes; see `gather`.
 
     Raises:
         InputError: As `gather`, or if `episodes` is negative or `out` is not an HTML file that can be written.
@@ -76,11 +71,11 @@ def write_report(
         raise InputError(f"the number of episodes of an evaluation must be 0 or more, not {episodes}")
     check_page(out)
     data = gather(paths, episodes)
-    write_atomically(out, render(data, describe_differences).encode())
+    write_atomically(out, render(data).encode())
     return out
 
 
-def render(data: ReportData, describe_differences: DescribeDifferences | None = None) -> str:
+def render(data: ReportData) -> str:
     """Return the text of the page."""
     runs, tasks = data.runs, data.tasks
     seeds = len({run.config.seed for run in runs})
@@ -97,7 +92,7 @@ def render(data: ReportData, describe_differences: DescribeDifferences | None = 
         title=data.name,
         lead=lead,
         held_out={"table": _held_out(data), "figure": _held_out_figure(data)} if has_held_out else None,
-        tasks=[_task(data, task, describe_differences) for task in tasks],
+        tasks=[_task(data, task) for task in tasks],
         tolerance=f"{TOLERANCE:g}",
         commands=commands,
         runs=commands_of_runs,
@@ -105,7 +100,7 @@ def render(data: ReportData, describe_differences: DescribeDifferences | None = 
     )
 
 
-def _task(data: ReportData, task: str, describe_differences: DescribeDifferences | None) -> dict[str, Any]:
+def _task(data: ReportData, task: str) -> dict[str, Any]:
     methods = data.methods(task)
     curves = {"success": "success rate", "return": "return"}
     if any((run.episodes["peak_force"] > 0).any() for runs in methods.values() for run in runs):
@@ -125,7 +120,6 @@ def _task(data: ReportData, task: str, describe_differences: DescribeDifferences
         "seeds": _seeds(methods),
         "safety": _safety(safety),
         "source": _source(safety),
-        "differences": None if describe_differences is None else _differences(methods, describe_differences),
         "differing": differing,
         "common": common,
     }
@@ -214,21 +208,6 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
     if sources == {"table"}:
         return "From the tables of episodes, without complete step logs: violations are counted in episodes."
     return "From complete step logs; for other runs, from the tables of episodes, where violations count episodes."
-
-
-def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDifferences) -> list[dict[str, Any]]:
-    """Return the differences from the reference: first the differences of all methods, then those of single methods."""
-    of_methods = {
-        name: list(dict.fromkeys(text for run in runs for text in describe_differences(run.config)))
-        for name, runs in methods.items()
-    }
-    first = next(iter(of_methods.values()))
-    common = [text for text in first if all(text in texts for texts in of_methods.values())]
-    groups = [{"names": "", "texts": common}] if common else []
-    for name, texts in of_methods.items():
-        if own := [text for text in texts if text not in common]:
-            groups.append({"names": f"{name} also in" if common else name, "texts": own})
-    return groups or [{"names": "", "texts": ["nothing in its configuration"]}]
 
 
 def _configuration(methods: dict[str, list[Run]]) -> tuple[Table | None, Table]:

@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from functools import partial
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,13 +43,9 @@ from guiderail_studies.job import (
 )
 from guiderail_studies.progress import StudyProgress
 
-ALL_METHODS = "all methods"
 LINE_STYLES = ("-", "--", "-.", ":")  # used in turn, because curves of methods that always or never succeed coincide
 BREAKING_SUCCESS = 0.9  # success rate below which a method counts as broken
 NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
-
-# Function from a configuration to sentences on how it differs from a reference; `learns=False` omits the learner.
-DescribeDifferences: TypeAlias = Callable[..., list[str]]
 
 
 def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataFrame:
@@ -93,7 +89,6 @@ def study_command(
     out: Path,
     engine: Engine | None = None,
     table: str | None = None,
-    describe_differences: DescribeDifferences | None = None,
     *,
     file: Path | None = None,
 ) -> dict[str, Any]:
@@ -106,7 +101,6 @@ def study_command(
         out: As in `run_study`; the table and the picture are written into it.
         engine: As in `run_study`.
         table: Name of the table and the picture; by default that of the study.
-        describe_differences: Function whose sentences the summary has as `differences`, by method.
         file: File of the study, which a report names in the command that runs the study again.
 
     Returns:
@@ -140,24 +134,7 @@ def study_command(
             result[f"{method}{after}, episodes to convergence, each seed"] = converged
     for wanted in study.ratios:
         result |= ratio(rows, wanted)
-    if describe_differences is not None:
-        result["differences"] = differences_by_method(study, describe_differences)
     return result
-
-
-def differences_by_method(study: Study, describe_differences: DescribeDifferences) -> dict[str, list[str]]:
-    """Return the differences from a reference: first those of all methods, then those of groups of methods."""
-    differences = {}
-    for method in study.methods:
-        job = Job(study, method, study.seeds[0], Path())
-        differences[method] = describe_differences(job.config(job.after_episodes[-1]), learns=job.learns)
-    first, *others = differences.values()
-    common = [sentence for sentence in first if all(sentence in other for other in others)]
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for method, sentences in differences.items():
-        groups.setdefault(tuple(sentence for sentence in sentences if sentence not in common), []).append(method)
-    shared = {ALL_METHODS: common} if common else {}
-    return shared | {", ".join(methods): list(sentences) for sentences, methods in groups.items() if sentences}
 
 
 def method_rows(rows: pd.DataFrame) -> list[dict[str, Any]]:
