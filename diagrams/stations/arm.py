@@ -17,6 +17,7 @@ from guiderail.diagrams.stations.options import ArmOptions, JointTorqueAccuracy
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
+    WRENCH_TIME_CONSTANT,
     ControllerPlant,
     Impedance,
     Station,
@@ -131,7 +132,6 @@ class ArmStation(Station):
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
         time_step: float | None = None,
-        wrench_time_constant: float = 0.01,
         *,
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
@@ -144,7 +144,6 @@ class ArmStation(Station):
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
             time_step: Time step of plant and controller [s]; that of the workcell, or `PLANT_PERIOD` by default.
-            wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.
             joint_torque: Errors of the joint torques from which the wrench is estimated; None for a sensor at the
@@ -167,7 +166,7 @@ class ArmStation(Station):
         )
         plant, arm = self.plant, self.arm
         sensor = WrenchSensor(
-            plant, arm.wrist, arm.tool, arm.tool_center, workcell.X_WT.rotation(), time_step, wrench_time_constant
+            plant, arm.wrist, arm.tool, arm.tool_center, workcell.X_WT.rotation(), time_step, WRENCH_TIME_CONSTANT
         )
         builder.AddNamedSystem("wrench_sensor", sensor)
         sensor.connect(builder, plant)

@@ -27,6 +27,7 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    WRENCH_TIME_CONSTANT,
     ControllerPlant,
     Impedance,
     Station,
@@ -84,7 +85,6 @@ class GantryStation(Station):
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
         time_step: float | None = None,
-        wrench_time_constant: float = 0.01,
         impedance_control: ImpedanceControl = "joint",
         control_period: float = CONTROL_PERIOD,
     ):
@@ -95,7 +95,6 @@ class GantryStation(Station):
             impedance: Impedance at the tool center.
             time_step: Time step of the plant [s]; default: that of the workcell, or half of `CONTROL_PERIOD`, a quarter
                 for "cartesian".
-            wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             impedance_control: "joint" or "cartesian", see `GantryStation`.
             control_period: Time between commands [s], a whole multiple of the time step.
 
@@ -118,7 +117,7 @@ class GantryStation(Station):
         plant, gantry = self.plant, self.gantry
         state = plant.get_state_output_port(gantry)
         pose = add_system(builder, "pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)), state).get_output_port()
-        wrench = _add_wrench(builder, plant, gantry, pose, wrench_time_constant)
+        wrench = _add_wrench(builder, plant, gantry, pose)
         if is_joint:
             desired = add_joint_impedance(
                 builder,
@@ -213,14 +212,14 @@ def _add_gantry(
 
 
 def _add_wrench(
-    builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
+    builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort
 ) -> OutputPort:
     """Add the contact wrench with a low-pass filter and, as from a sensor, a delay of one plant step; return its port.
 
     Only C++ systems of Drake run at every plant step; the Python system `PoseWrench` runs when its output is read.
     """
     period = plant.time_step()
-    decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
+    decay = float(np.exp(-period / WRENCH_TIME_CONSTANT))
     identity = np.eye(POSE_SIZE)
     low_pass = LinearSystem(decay * identity, (1.0 - decay) * identity, identity, 0 * identity, period)
     add_system(builder, "low_pass", low_pass, plant.get_generalized_contact_forces_output_port(gantry))

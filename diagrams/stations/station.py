@@ -71,6 +71,7 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # default time step of a plant [s]
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
+WRENCH_TIME_CONSTANT = 0.01  # time constant of the low-pass filter of a simulated wrench [s]
 COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; at least two control periods
 
 _FINEST = 2**47  # largest denominator of a time step of which a day's multiples are exact, [1/s]

@@ -145,23 +145,23 @@ class ReferenceTrajectory:
         after = np.maximum(steps - last, 0) * (self.times[-1] - self.times[-2])
         return inside + before + after
 
-    def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
+    def resampled(self, period: float) -> ReferenceTrajectory:
+        """Return this trajectory with a `period` [s] between steps.
 
         Means and covariances are interpolated linearly over the clock. The new duration includes a mean time step after
         the last time. The number of steps is this duration divided by the period, rounded.
 
         Raises:
-            InputError: If an argument is not positive, or fewer than two or more than `MAX_STEPS` steps remain.
+            InputError: If the period is not positive, or fewer than two or more than `MAX_STEPS` steps remain.
         """
-        if not (0.0 < period < np.inf and 0.0 < time_scale < np.inf):
-            raise InputError(f"a period and a time scale must be positive, not {period} s and {time_scale}")
+        if not 0.0 < period < np.inf:
+            raise InputError(f"a period must be positive, not {period} s")
         step = (self.times[-1] - self.times[0]) / (self.num_steps - 1)
-        duration = self.num_steps * step * time_scale
+        duration = self.num_steps * step
         number = num_periods(duration, period)
         clock = period * np.arange(number)
         nodes = np.arange(self.num_steps) if self.uniform else (self.times - self.times[0]) / step
-        at = np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
+        at = np.clip(clock / step, 0.0, self.num_steps - 1)
         columns = np.hstack([self.means, self.covariances.reshape(self.num_steps, -1)])
         resampled = np.column_stack([np.interp(at, nodes, column) for column in columns.T])
         outputs = self.num_outputs

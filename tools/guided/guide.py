@@ -79,9 +79,11 @@ class Guide(ABC):
         last = self._last
         self._now = self._state if last is None else self._law.next(self._state, last, pose)
         extra = self._extra()  # may call a function of the user, whose error must not skip a command
-        returned = self._law.command(self._now, np.clip(action, -1.0, 1.0), pose, np.zeros(0))
-        is_primitive = isinstance(self._law, PrimitiveLaw)  # its commands are finite, in the segment's frame
-        command = returned if is_primitive else safe_command(returned, pose if last is None else last.pose)
+        arguments = self._now, np.clip(action, -1.0, 1.0), pose, np.zeros(0)
+        if isinstance(self._law, PrimitiveLaw):  # its commands are finite, in the segment's frame
+            command = self._law.command(*arguments)
+        else:
+            command = safe_command(self._law.command(*arguments), pose if last is None else last.pose)
         self._state, self._last = self._now, command
         return command, extra
 
@@ -384,7 +386,6 @@ class TemplateGuide(Guide):
         frames: (env, observation) → poses X_WF of the template's objects by name, called at reset; each is a
             `RigidTransform` of `guiderail.models.common.transforms` or of Drake.
         period: Control period [s], positive.
-        extra: Value for `to_action`, or (name of the state) → value.
     """
 
     num_outputs = POSE_SIZE
@@ -394,7 +395,6 @@ class TemplateGuide(Guide):
         template: SharedControlTemplate,
         frames: Callable[[Any, Any], Mapping[str, Any]],
         period: float | None,
-        extra: Any = None,
     ):
         TemplateLaw(template, {}, period)  # refuses invalid arguments before an episode
         if template.limits_wrench:
@@ -402,7 +402,7 @@ class TemplateGuide(Guide):
                 f"states of template {template.name!r} limit force or torque, and GuidedEnv has no controller that "
                 "could follow the limit: remove max_force_n and max_torque_nm, and bound the force in the environment"
             )
-        self.template, self._frames_of, self._period, self._extra_of = template, frames, period, extra
+        self.template, self._frames_of, self._period = template, frames, period
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
@@ -414,9 +414,6 @@ class TemplateGuide(Guide):
         self._frames = {name: RigidTransform(X_WF) for name, X_WF in frames.items()}
         self._begin(TemplateLaw(self.template, self._frames, self._period), pose)
         self._now = self._state
-
-    def _extra(self) -> Any:
-        return self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
 
     @property
     def phase(self) -> float:

@@ -20,6 +20,7 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    WRENCH_TIME_CONSTANT,
     Impedance,
     Station,
     check_pose,
@@ -199,7 +200,6 @@ class MujocoStation(Station):
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
         time_step: float | None = None,
-        wrench_time_constant: float = 0.01,
         contact: MujocoContact = MujocoContact(),
         control_period: float = CONTROL_PERIOD,
     ):
@@ -209,7 +209,6 @@ class MujocoStation(Station):
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
             time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
-            wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             contact: Parameters of contact and integration.
             control_period: Time between commands [s], a whole multiple of the time step.
 
@@ -230,7 +229,7 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
         self._time_step = time_step
-        self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, WRENCH_TIME_CONSTANT)
         add_system(builder, "gantry", gantry, nominal_body_poses=plant.get_body_poses_output_port())
         desired_pose = add_joint_impedance(
             builder,
