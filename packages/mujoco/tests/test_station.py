@@ -246,7 +246,7 @@ def test_engine_bodies_have_the_offsets_of_the_reset():
     _, info = env.reset(seed=2)
     station = env.diagram.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))
-    model = station.gantry.model
+    model = station.gantry.engine.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])
     expected = (X_TT @ CONNECTOR.X_FT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
