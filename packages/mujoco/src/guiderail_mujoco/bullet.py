@@ -51,8 +51,8 @@ class BulletEngine:
     """Bullet as an `Engine`: rigid contact with a friction cone.
 
     Tool and workpiece are one free body. The impedance's wrench acts on it, and the contact's wrench is the change of
-    its momentum less that wrench. Its center of mass is at the workpiece's origin, and its moments of inertia are equal.
-    Contacts are detected anew in each step, so the state is that of the bodies alone.
+    its momentum less that wrench. Its center of mass is at the workpiece's origin, and its moments of inertia are
+    equal. Contacts are detected again in each step, so the state is that of the bodies alone.
     """
 
     name = "Bullet"

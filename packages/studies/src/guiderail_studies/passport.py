@@ -53,7 +53,8 @@ def passport_conditions(
     if "time_step" not in resolved:
         raise InputError(f"{task} on station={resolved.get('station')!r} has no contact that other engines simulate")
     axes = [replace(axis, values=CHANGES[axis.name]) for axis in select_axes(",".join(CHANGES))]
-    found: list[Condition] = []
+    steps: list[Condition] = []
+    changes: list[Condition] = []
     for name in names:
         default = 1e3 * plant_step(task, environment) if name == "drake" else ENGINE_STEP
         own = [in_engine(name, environment, default / division) for division in DIVISIONS[name]]
@@ -64,12 +65,12 @@ def passport_conditions(
         changed, left_out = points(task, own[0].environment, axes)
         for sentence in left_out:
             log(f"{ENGINES[name]}: {sentence}")
-        found += own
-        found += [
+        steps += own
+        changes += [
             replace(own[0], environment=point.environment, change=f"{point.axis.name} × {point.value:g}")
             for point in changed
         ]
-    return found
+    return steps + changes
 
 
 def passport(
