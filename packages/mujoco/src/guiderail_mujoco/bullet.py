@@ -6,6 +6,7 @@ import math
 import tempfile
 import weakref
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -171,8 +172,8 @@ class BulletEngine:
         """Return the number of a collision shape in the frame of the only surface, or in that of the body."""
         bullet, shape = self._bullet, surfaces[0].shape
         if isinstance(shape, Hull):
-            placed = [_vertices(surface) if len(surfaces) > 1 else surface.shape.vertices for surface in surfaces]
-            return self._hulls([SCALE * vertices for vertices in placed], folder)
+            solids = [shape.vertices] if len(surfaces) == 1 else [_vertices(surface) for surface in surfaces]
+            return self._hulls([SCALE * vertices for vertices in solids], folder)
         if isinstance(shape, Box):
             half = [0.5 * SCALE * edge for edge in (shape.x, shape.y, shape.z)]
             return int(bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, **self._client))
@@ -290,6 +291,7 @@ def _bullet_pose(X: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
 
 def _vertices(surface: Surface) -> np.ndarray:
     """Return the vertices of a hull in the frame of its body (V, 3) [m]."""
+    assert isinstance(surface.shape, Hull)
     R = RotationMatrix.MakeYRotation(surface.pitch).matrix()
     return np.asarray(surface.shape.vertices) @ R.T + surface.position
 
@@ -310,6 +312,6 @@ class BulletStation(EngineStation):
         """Construct the station; see `MujocoStation` for arguments and errors, and `BulletEngine` for its limits."""
         step = STEP if engine_step is None else engine_step
         super().__init__(
-            "pybullet", lambda *model: BulletEngine(*model, step), workcell, impedance, time_step,
+            "pybullet", partial(BulletEngine, step=step), workcell, impedance, time_step,
             wrench_time_constant, control_period,
         )  # fmt: skip

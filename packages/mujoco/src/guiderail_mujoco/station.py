@@ -69,8 +69,8 @@ def mujoco_model(
     workpiece: list[Surface],
     inertia: SpatialInertia,
     impedance: Impedance,
-    contact: MujocoContact,
     period: float,
+    contact: MujocoContact,
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
@@ -308,7 +308,9 @@ class MujocoStation(EngineStation):
         contact = contact if engine_step is None else replace(contact, time_step=engine_step)
         super().__init__(
             "mujoco",
-            lambda *model: MujocoEngine(mujoco_model(*model[:-1], contact, model[-1])),
+            lambda fixture, held, inertia, impedance, period: MujocoEngine(
+                mujoco_model(fixture, held, inertia, impedance, period, contact)
+            ),
             workcell, impedance, time_step, wrench_time_constant, control_period,
         )  # fmt: skip
 
