@@ -27,11 +27,12 @@ GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor", "station:hardware"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "ensemble", "robustness", "converge", "certify", "report", "benchmark", "learner:ppo"),
+    "studies": ("study", "ensemble", "robustness", "converge", "passport", "certify", "report", "benchmark",
+                "learner:ppo"),
     "data": ("dataset", "template"),
     "lerobot": ("learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy",
                 "guidance:kgrl_base_policy", "guidance:residual_base_policy"),
-    "mujoco": ("station:mujoco",),
+    "mujoco": ("station:mujoco", "station:pybullet"),
     "cpp": ("export",),
     "calibration": ("calibrate", "probe"),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail_mujoco.gantry import MovedBodies, MujocoGantry
+from guiderail_mujoco.gantry import EngineGantry, MovedBodies
 from guiderail_mujoco.station import MujocoStation
 
 FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # pose 50 mm above the jack
@@ -91,7 +91,7 @@ def test_contact_stiffness_scales_with_the_modulus():
 
 
 def test_model_is_unchanged_by_an_earlier_higher_modulus(station):
-    model = station.gantry.model
+    model = station.gantry.engine.model
     names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
     before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
     for factors in ((0.5, 7.0), (1.0, 1.0)):
@@ -126,4 +126,4 @@ def test_constructor_refuses_arguments_out_of_range(station, period, constant):
     plant = station.plant
     moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_center", "plug")))
     with pytest.raises(InputError):
-        MujocoGantry(station.gantry.model, plant, moved, BncWorkcell().X_WT, period, constant)
+        EngineGantry(station.gantry.engine, Impedance(), plant, moved, BncWorkcell().X_WT, period, constant)

@@ -18,6 +18,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_
 pytest.importorskip("mujoco")
 import mujoco
 
+from guiderail_mujoco.bullet import BulletStation
 from guiderail_mujoco.station import MujocoContact, MujocoStation, constraint_torques, mujoco_parts
 from guiderail_mujoco.surfaces import surfaces_of
 
@@ -246,7 +247,7 @@ def test_engine_bodies_have_the_offsets_of_the_reset():
     _, info = env.reset(seed=2)
     station = env.diagram.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))
-    model = station.gantry.model
+    model = station.gantry.engine.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])
     expected = (X_TT @ CONNECTOR.X_FT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
@@ -288,6 +289,18 @@ def test_station_raises_when_mujoco_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r'pip install "guiderail\[mujoco\]"'):
         MujocoStation(CONNECTOR)
+
+
+def test_station_raises_when_pybullet_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(InputError, match=r'pip install "guiderail\[pybullet\]"'):
+        BulletStation(CONNECTOR)
+
+
+def test_engine_step_is_rounded_to_a_fraction_of_the_time_step():
+    for given, expected in ((0.0004, 0.01 / 25), (0.003, 0.01 / 3), (None, 0.001)):
+        engine = MujocoStation(CONNECTOR, engine_step=given).gantry.engine
+        assert engine.time_step == engine.model.opt.timestep == pytest.approx(expected)
 
 
 def test_parts_with_more_pairs_than_mask_bits_are_refused():

@@ -1,5 +1,7 @@
 """Shipped tasks with every guidance and station: episodes, ports, options and held-out conditions."""
 
+from importlib.util import find_spec
+
 import gymnasium
 import numpy as np
 import pytest
@@ -48,7 +50,8 @@ def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
 
 @pytest.mark.parametrize("task", SHIPPED)
 def test_station_and_guidance_have_the_declared_ports(task):
-    for name in stations_of(TASKS.get(task)):
+    installed = find_spec("pybullet") is not None  # without it, station=pybullet cannot be built
+    for name in (name for name in stations_of(TASKS.get(task)) if installed or name != "pybullet"):
         if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).diagram.diagram
         else:

@@ -1,7 +1,7 @@
-"""Workcell with a tool on a gantry, simulated by MuJoCo."""
+"""Workcell with a tool on a gantry, simulated by a physics engine other than Drake."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -11,14 +11,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError, brief, import_extra
+from guiderail.diagrams.stations.gantry import joint_damping
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
-
-if TYPE_CHECKING:
-    import mujoco
 
 MAX_JOINT_SPEED = 1e3  # joint speed above which a simulation counts as diverged [m/s, rad/s]
 
@@ -28,37 +27,64 @@ class DivergedError(RuntimeError):
 
 
 class MovedBodies(NamedTuple):
-    """Bodies of a plant that the MuJoCo model also contains: fixture, tool, and the workpiece fixed to the tool."""
+    """Bodies of a plant that the engine's model also contains: fixture, tool, and the workpiece fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
     workpiece: RigidBody
 
 
-class _Nominal(NamedTuple):
-    """Nominal values of the model parameters that `set_contact` scales; the names are MuJoCo's."""
+class Input(NamedTuple):
+    """Constant input of an engine during one update."""
 
-    timestep: float
-    geom_friction: np.ndarray
-    jnt_stiffness: np.ndarray
-    dof_damping: np.ndarray
-    geom_solref: np.ndarray
+    desired_pose: np.ndarray  # desired pose of the tool center, (6,) [m, rad]
+    X_TFixture: RigidTransform  # pose of the fixture in the target frame
+    X_PWorkpiece: RigidTransform  # pose of the workpiece relative to the tool center
+    friction: float  # factor of all friction coefficients
+    modulus: float  # factor of the stiffness of contacts and springs
 
 
-class MujocoGantry(LeafSystem):
-    """Simulate a MuJoCo model of a tool with the six joints x, y, z, Rz, Ry, Rx in a target frame T.
+class Engine(Protocol):
+    """Physics engine with a model of a tool on the joints x, y, z, Rz, Ry, Rx in the target frame.
+
+    It keeps no state between updates: everything that it needs is in the state vector.
+    """
+
+    name: str  # name in messages
+    time_step: float  # nominal time step [s]
+    state_size: int  # size of the state vector
+    positions: slice  # part of the state with the pose of the tool center, (6,)
+    speeds: slice  # part of the state with the velocities of all joints, the time derivative of the pose first
+
+    def at_rest(self, pose: np.ndarray) -> np.ndarray:
+        """Return the state with the tool at rest at `pose` (6,)."""
+
+    def advance(self, state: np.ndarray, given: Input, num_steps: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the state after `num_steps` nominal time steps.
+
+        Returns:
+            State; contact wrench on the tool (N, 6) in each of the actual time steps, at the tool center in the axes
+            of T, force first; the actual time step [s].
+
+        Raises:
+            DivergedError: If the engine reports a failure.
+        """
+
+
+class EngineGantry(LeafSystem):
+    """Simulate an engine's model of a tool with the six joints x, y, z, Rz, Ry, Rx in a target frame T.
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
     q is the pose of the tool, M and c are its inertia and bias forces, and x_d is the desired pose. K, D and the limits
-    are parameters of the six motors. The engine computes the contact forces f. w is the wrench of f on the tool, at the
+    are those of an impedance. The engine computes the contact forces f. w is the wrench of f on the tool, at the
     tool center in the axes of T, and y is the filtered wrench. A static plant defines the pose of the fixture, and the
-    pose of the workpiece relative to the tool, including their offsets. Before every update, the bodies of the model
-    are placed at these poses.
+    pose of the workpiece relative to the tool, including their offsets. In every update, the bodies of the engine's
+    model are placed at these poses.
 
     .. pydrake_system::
 
-        name: MujocoGantry
+        name: EngineGantry
         input_ports:
         - desired_pose
         - nominal_body_poses
@@ -74,28 +100,27 @@ class MujocoGantry(LeafSystem):
     output of the static plant. ``body_poses`` contains the same poses, except that tool and workpiece have their
     simulated poses. ``state`` is (12,), the pose and its time derivative. ``geometry_poses`` contains the poses of all
     frames with geometry. ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is
-    (6,), the forces and torques of the six motors in the order of the pose. Positions, velocities and warm start of the
-    engine and the state of the filter are declared discrete state.
-
-    The engine's automatic reset after a divergence is disabled, because it would move the tool to the target.
+    (6,), the forces and torques of the six joints in the order of the pose. The state of the engine and of the filter
+    is declared discrete state.
 
     Args:
-        model: MuJoCo model with bodies `fixture` and `workpiece`, whose first six joints and motors move the tool; this
-            system writes to it.
+        engine: Physics engine; this system writes to its model.
+        impedance: Impedance that the engine's model has.
         plant: Finalized plant without joints, registered as a source of geometry.
         moved: Bodies of the plant that the model also contains.
         X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
-        period: Update period [s], positive, an integer multiple of the model's step.
+        period: Update period [s], positive, an integer multiple of the engine's step.
         time_constant: τ of the wrench filter [s], not negative, finite; 0 disables it.
 
     Raises:
-        InputError: If a number is out of range, or the model's step does not divide the period.
+        InputError: If a number is out of range, or the engine's step does not divide the period.
         DivergedError: At an update, if the engine diverges, or its contact or constraint buffer is full.
     """
 
     def __init__(
         self,
-        model: "mujoco.MjModel",
+        engine: Engine,
+        impedance: Impedance,
         plant: MultibodyPlant,
         moved: MovedBodies,
         X_WT: RigidTransform,
@@ -106,35 +131,25 @@ class MujocoGantry(LeafSystem):
         check_period(period)
         if not 0.0 <= time_constant < np.inf:
             raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
-        step = float(model.opt.timestep)
+        step = engine.time_step
         self._num_steps = round(period / step)
         if abs(self._num_steps * step - period) > 1e-9:
-            raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
-        self._mujoco = import_extra("mujoco")
-        model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
-        self.model, self._data = model, self._mujoco.MjData(model)
-        # Warnings of divergence and of a full buffer: the engine ignores contacts and constraints that exceed a buffer.
-        failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
-        self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
-        # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.
-        self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
+            raise InputError(f"{engine.name}'s step of {step} s does not divide the period of {period} s")
+        self.engine = engine
+        self._stiffness, self._damping = np.array(impedance.stiffness), joint_damping(impedance)
+        self._limits = np.array(impedance.limits)
         self._time_constant = time_constant
         self._X_WT, self._X_TW = X_WT, X_WT.inverse()
-        self._fixture, self._workpiece = (model.body(name).id for name in ("fixture", "workpiece"))
         self._moved = MovedBodies(*(int(body.index()) for body in moved))
         frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
         self._frames = [(body, frame) for body, frame in frames if frame is not None]  # only bodies with geometry
-        size = self._mujoco.mj_stateSize(model, self._parts)
-        self._physics = slice(0, size)
-        self._filtered = slice(size, size + 6)
-        # The state of the engine starts with time, positions and velocities.
-        self._positions = slice(1, 1 + POSE_SIZE)
-        self._velocities = slice(1 + model.nq, 1 + model.nq + POSE_SIZE)
+        self._physics = slice(0, engine.state_size)
+        self._filtered = slice(engine.state_size, engine.state_size + 6)
+        self._positions = engine.positions
+        self._velocities = slice(engine.speeds.start, engine.speeds.start + POSE_SIZE)
         poses = plant.get_body_poses_output_port()
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._nominal_body_poses_port = self.DeclareAbstractInputPort("nominal_body_poses", poses.Allocate())
-        self._nominal = _Nominal(step, *(getattr(model, name).copy() for name in _Nominal._fields[1:]))
         self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
         body_poses = declare.tickets(self, [self._state, self._nominal_body_poses_port])
@@ -162,7 +177,7 @@ class MujocoGantry(LeafSystem):
     get_pose_output_port = output_getter("pose", "pose of the tool center, (6,)")
     get_state_output_port = output_getter("state", "pose of the tool center and its velocity, (12,)")
     get_wrench_output_port = output_getter("wrench", "filtered wrench on the tool, (6,), force first")
-    get_impedance_wrench_output_port = output_getter("impedance_wrench", "forces and torques of the six motors, (6,)")
+    get_impedance_wrench_output_port = output_getter("impedance_wrench", "forces and torques of the six joints, (6,)")
     get_body_poses_output_port = output_getter("body_poses", "poses of all bodies of the plant")
     get_geometry_poses_output_port = output_getter("geometry_poses", "poses of all frames with geometry")
 
@@ -186,90 +201,37 @@ class MujocoGantry(LeafSystem):
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
     def _at_rest(self, pose: np.ndarray) -> np.ndarray:
-        self._mujoco.mj_resetData(self.model, self._data)
-        self._data.qpos[:POSE_SIZE] = pose
-        return np.concatenate([self._engine_state(), np.zeros(6)])
-
-    def _engine_state(self) -> np.ndarray:
-        state = np.empty(self._physics.stop)
-        self._mujoco.mj_getState(self.model, self._data, state, self._parts)
-        return state
+        return np.concatenate([self.engine.at_rest(pose), np.zeros(6)])
 
     def _values(self, context: Context) -> np.ndarray:
         return context.get_discrete_state().value(self._state)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        model, data = self.model, self._data
-        state = self._values(context)
-        self._place(self._nominal_body_poses_port.Eval(context))
-        num_substeps = self._scale_contact(*context.get_numeric_parameter(self._factors).value())
-        self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
-        data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
-        # Warning counts start at 1, because at 0 the engine would write a log file to the working directory at the
-        # first warning.
-        for warning in self._failures:
-            data.warning[warning].number = 1
+        state, poses = self._values(context), self._nominal_body_poses_port.Eval(context)
+        given = Input(
+            self._desired_pose_port.Eval(context),
+            self._X_TW @ poses[self._moved.fixture],
+            poses[self._moved.tool].InvertAndCompose(poses[self._moved.workpiece]),
+            *context.get_numeric_parameter(self._factors).value(),
+        )
+        physics, wrenches, step = self.engine.advance(state[self._physics].copy(), given, self._num_steps)
         filtered = state[self._filtered]
-        decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
-        for _ in range(num_substeps * self._num_steps):
-            self._mujoco.mj_step(model, data)
-            self._check_warnings()
-            newest = self._contact_wrench()
+        decay = np.exp(-step / self._time_constant) if self._time_constant > 0.0 else 0.0
+        for newest in wrenches:
             filtered = newest + decay * (filtered - newest)
-        next_state = np.concatenate([self._engine_state(), filtered])
+        next_state = np.concatenate([physics, filtered])
         if not np.isfinite(next_state).all():
-            raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
-        if np.abs(data.qvel).max() > MAX_JOINT_SPEED:
+            raise DivergedError(f"the simulation failed in {self.engine.name}: its state is not finite")
+        if np.abs(physics[self.engine.speeds]).max() > MAX_JOINT_SPEED:
             raise DivergedError(
-                f"the simulation failed in MuJoCo: a joint is faster than {MAX_JOINT_SPEED:g} m/s or rad/s"
+                f"the simulation failed in {self.engine.name}: a joint is faster than {MAX_JOINT_SPEED:g} m/s or rad/s"
             )
         discrete_state.set_value(self._state, next_state)
 
-    def _check_warnings(self) -> None:
-        numbers = self._data.warning.number[self._failures]
-        if numbers.max() > 1:
-            warning = self._failures[int(numbers.argmax())]
-            about = int(self._data.warning[warning].lastinfo)
-            raise DivergedError(f"the simulation failed in MuJoCo: {self._mujoco.mju_warningText(warning, about)}")
-
-    def _place(self, poses: list[RigidTransform]) -> None:
-        X_TFixture = self._X_TW @ poses[self._moved.fixture]
-        X_PWorkpiece = poses[self._moved.tool].InvertAndCompose(poses[self._moved.workpiece])
-        for body, X in ((self._fixture, X_TFixture), (self._workpiece, X_PWorkpiece)):
-            self.model.body_pos[body] = X.translation()
-            self.model.body_quat[body] = X.rotation().ToQuaternion().wxyz()
-
-    def _scale_contact(self, friction: float, modulus: float) -> int:
-        """Scale the model's contact parameters and return the number of substeps that replace one step.
-
-        With the substeps, the engine can integrate stiffer springs. The time constant of a contact is at least two
-        substeps. The damping of stiffer springs is increased so that their damping ratio is constant.
-        """
-        model, nominal = self.model, self._nominal
-        num_substeps = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
-        model.opt.timestep = nominal.timestep / num_substeps
-        model.geom_friction[:] = nominal.geom_friction * friction
-        model.jnt_stiffness[:] = nominal.jnt_stiffness * modulus
-        model.dof_damping[:] = nominal.dof_damping * math.sqrt(max(modulus, 1.0))
-        constants = nominal.geom_solref[:, 0] / math.sqrt(modulus)
-        model.geom_solref[:, 0] = np.maximum(constants, 2.0 * model.opt.timestep)
-        return num_substeps
-
-    def _contact_wrench(self) -> np.ndarray:
-        """Return the wrench of the generalized contact forces.
-
-        The prismatic joints are along the axes of T. For a torque t, the generalized force of a hinge about an axis a
-        is a · t.
-        """
-        generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
-        return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
-
     def _impedance_wrench(self, context: Context) -> np.ndarray:
-        model, state = self.model, self._values(context)
-        springs, dampers = model.actuator_gainprm[:POSE_SIZE, 0], -model.actuator_biasprm[:POSE_SIZE, 2]
-        spring_force = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
-        limits = model.actuator_forcerange[:POSE_SIZE]
-        return np.clip(spring_force - dampers * state[self._velocities], limits[:, 0], limits[:, 1])
+        state = self._values(context)
+        spring_force = self._stiffness * (self._desired_pose_port.Eval(context) - state[self._positions])
+        return np.clip(spring_force - self._damping * state[self._velocities], -self._limits, self._limits)
 
     def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
         poses = list(self._nominal_body_poses_port.Eval(context))

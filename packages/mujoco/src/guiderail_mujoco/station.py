@@ -1,18 +1,20 @@
-"""Gantry station in MuJoCo, to evaluate skills with another contact model than Drake's."""
+"""Gantry station in another physics engine, to evaluate skills with another contact model than Drake's; MuJoCo's."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import Field
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, joint_damping
 from guiderail.diagrams.stations.impedance_control import add_joint_impedance
 from guiderail.diagrams.stations.options import ContactOptions
@@ -30,7 +32,8 @@ from guiderail.diagrams.stations.workcell import Cylinder, Hull, Surface, Workce
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail_mujoco.gantry import MovedBodies, MujocoGantry
+from guiderail_mujoco.gantry import Engine, EngineGantry, MovedBodies
+from guiderail_mujoco.mujoco_engine import MujocoEngine
 from guiderail_mujoco.surfaces import surfaces_of
 
 if TYPE_CHECKING:
@@ -41,6 +44,10 @@ FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
 """Names of the model's bodies. The workpiece is the tool's child; the first six joints of the model are the tool's."""
 
 CENTERED: dict[str, Any] = {"ipos": [0.0, 0.0, 0.0], "explicitinertial": True}  # center of mass at a body's origin
+MakeEngine = Callable[[list[Surface], list[Surface], SpatialInertia, Impedance, float], Engine]
+"""Function from the surfaces of fixture and workpiece, the workpiece's inertia, the impedance and the station's time
+step [s] to an engine."""
+
 MAX_PAIRS = 31  # number of bits of a contact mask, a signed integer of 32 bits, without the sign
 
 
@@ -63,8 +70,8 @@ def mujoco_model(
     workpiece: list[Surface],
     inertia: SpatialInertia,
     impedance: Impedance,
-    contact: MujocoContact,
     period: float,
+    contact: MujocoContact,
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
@@ -75,7 +82,7 @@ def mujoco_model(
         InputError: If MuJoCo is not installed, or the surfaces have more pairs than a contact mask has bits.
     """
     mujoco = import_extra("mujoco")
-    masks = _contact_masks((*fixture, *workpiece))
+    masks = contact_masks((*fixture, *workpiece))
     spec = mujoco.MjSpec()
     spec.modelname = "workcell"
     spec.compiler.autolimits = True
@@ -116,7 +123,7 @@ def mujoco_parts(
         InputError: As `mujoco_model`.
     """
     mujoco = import_extra("mujoco")
-    masks = _contact_masks((*fixture, *workpiece), first_bit=1)
+    masks = contact_masks((*fixture, *workpiece), first_bit=1)
     spec = mujoco.MjSpec()
     spec.option.timestep = contact.time_step
     for name, surfaces, side in ((FIXTURE, fixture, "conaffinity"), (WORKPIECE, workpiece, "contype")):
@@ -130,7 +137,7 @@ def mujoco_parts(
     return bodies[FIXTURE], bodies[WORKPIECE], list(root.findall("asset/*"))
 
 
-def _contact_masks(surfaces: Sequence[Surface], first_bit: int = 0) -> dict[str, int]:
+def contact_masks(surfaces: Sequence[Surface], first_bit: int = 0) -> dict[str, int]:
     """Return a contact mask of one bit for each pair of surfaces, by the name of the pair."""
     pairs = sorted({surface.pair for surface in surfaces})
     if len(pairs) > (most := MAX_PAIRS - first_bit):
@@ -187,9 +194,16 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
     )
 
 
-@register_station("mujoco", workcell_kind="insertion", options=ContactOptions)
-class MujocoStation(Station):
-    """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter.
+class EngineOptions(ContactOptions):
+    """Options of a station in another physics engine."""
+
+    engine_step: Number | None = Field(
+        None, gt=0, description="time step of the physics engine [s], rounded so that it divides time_step"
+    )
+
+
+class EngineStation(Station):
+    """`GantryStation` in another physics engine, with the same ports, joints, impedance, watchdog and filter.
 
     A Drake plant without joints and time step contains the visual geometry and the poses of fixture and workpiece. A
     reset sets these poses in the plant's context.
@@ -197,25 +211,16 @@ class MujocoStation(Station):
 
     def __init__(
         self,
+        name: str,
+        make_engine: MakeEngine,
         workcell: Workcell,
-        impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        time_step: float | None = None,
-        contact: MujocoContact = MujocoContact(),
-        control_period: float = CONTROL_PERIOD,
+        impedance: Impedance,
+        time_step: float | None,
+        control_period: float,
     ):
-        """Construct the station.
+        """Construct the station `name`; `make_engine` returns its engine.
 
-        Args:
-            workcell: Fixture in the world and held workpiece.
-            impedance: Impedance at the tool center.
-            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
-            contact: Parameters of contact and integration.
-            control_period: Time between commands [s], a whole multiple of the time step.
-
-        Raises:
-            InputError: If MuJoCo is not installed, the workcell is not described by convex solids, its fixture has more
-                than one body, its surfaces have more than `MAX_PAIRS` pairs, or the control period is no multiple of
-                the time step.
+        The other arguments and errors are those of `MujocoStation`.
         """
         super().__init__()
         time_step = PLANT_PERIOD if time_step is None else time_step
@@ -225,11 +230,13 @@ class MujocoStation(Station):
         builder = DiagramBuilder()
         self.scene_graph = builder.AddSystem(SceneGraph())
         self.plant = plant = builder.AddNamedSystem("plant", MultibodyPlant(0.0))
-        moved = _add_workcell(plant, self.scene_graph, workcell)
+        moved = _add_workcell(plant, self.scene_graph, workcell, name)
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
-        model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
+        engine = make_engine(*surfaces, inertia, impedance, time_step)
         self._time_step = time_step
-        self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, WRENCH_TIME_CONSTANT)
+        self.gantry = gantry = EngineGantry(
+            engine, impedance, plant, moved, workcell.X_WT, time_step, WRENCH_TIME_CONSTANT
+        )
         add_system(builder, "gantry", gantry, nominal_body_poses=plant.get_body_poses_output_port())
         desired_pose = add_joint_impedance(
             builder,
@@ -268,6 +275,44 @@ class MujocoStation(Station):
         self.gantry.set_contact(self.gantry.GetMyMutableContextFromRoot(context), friction, modulus)
 
 
+@register_station("mujoco", workcell_kind="insertion", options=EngineOptions)
+class MujocoStation(EngineStation):
+    """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter."""
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
+        time_step: float | None = None,
+        contact: MujocoContact = MujocoContact(),
+        control_period: float = CONTROL_PERIOD,
+        engine_step: float | None = None,
+    ):
+        """Construct the station.
+
+        Args:
+            workcell: Fixture in the world and held workpiece.
+            impedance: Impedance at the tool center.
+            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
+            contact: Parameters of contact and integration.
+            control_period: Time between commands [s], a whole multiple of the time step.
+            engine_step: Time step of the engine [s] instead of that of `contact`.
+
+        Raises:
+            InputError: If MuJoCo is not installed, the workcell is not described by convex solids, its fixture has more
+                than one body, its surfaces have more than `MAX_PAIRS` pairs, or the control period is no multiple of
+                the time step.
+        """
+        contact = contact if engine_step is None else replace(contact, time_step=engine_step)
+        super().__init__(
+            "mujoco",
+            lambda fixture, held, inertia, impedance, period: MujocoEngine(
+                mujoco_model(fixture, held, inertia, impedance, period, contact)
+            ),
+            workcell, impedance, time_step, control_period,
+        )  # fmt: skip
+
+
 def constraint_torques(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the generalized force of contacts and joint limits on the model (nv,), without joint friction.
 
@@ -280,13 +325,13 @@ def constraint_torques(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray
     return result
 
 
-def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:
+def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell, station: str) -> MovedBodies:
     """Add fixture, tool and workpiece to a plant without joints, and finalize it."""
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     workcell.add_fixture(plant)
     if plant.num_bodies() != 2:  # world and fixture
         raise InputError(
-            f"station='mujoco' needs a fixture of one body, and that of {type(workcell).__name__} has "
+            f"station={station!r} needs a fixture of one body, and that of {type(workcell).__name__} has "
             f"{plant.num_bodies() - 1}"
         )
     fixture = plant.get_body(BodyIndex(1))

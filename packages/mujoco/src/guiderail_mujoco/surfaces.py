@@ -1,4 +1,4 @@
-"""Convex solids of the core's workcells: Drake collides their meshes, which MuJoCo would replace by convex hulls."""
+"""Convex solids of the core's workcells: Drake collides their meshes, whose convex hulls other engines collide."""
 
 from typing import Any
 
@@ -25,6 +25,6 @@ def surfaces_of(workcell: Any) -> tuple[list[Surface], list[Surface]]:
         table = workcell.dimensions, workcell.friction
         return table_surfaces(*table), clamp_surfaces(*table)
     raise InputError(
-        f"MuJoCo needs convex solids, which {type(workcell).__name__} does not provide: implement the methods of "
+        f"this engine needs convex solids, which {type(workcell).__name__} does not provide: implement the methods of "
         "ConvexWorkcell"
     )

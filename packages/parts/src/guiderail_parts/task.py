@@ -123,7 +123,7 @@ class PartWorkcell(MovableWorkcell):
     def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:
         if not files:
             raise InputError(
-                f"the {body} in {self.folder} has no convex pieces, which MuJoCo needs: choose station='gantry'"
+                f"the {body} in {self.folder} has no convex pieces, which this engine needs: choose station='gantry'"
             )
         return [
             Surface(f"{body}_{number}", "parts", Hull(read_obj(self.folder / file).vertices), self.friction)
@@ -566,7 +566,7 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
     members = {
         "name": file.name,
         "scripted_policies": (ScriptedSearch(file, lambda: reference().num_steps * CONTROL_PERIOD),),
-        "unsupported_stations": () if file.is_convex else ("mujoco",),  # MuJoCo needs convex pieces
+        "unsupported_stations": () if file.is_convex else ("mujoco", "pybullet"),  # these need convex pieces
         "presets": {"hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
         "digest": content,

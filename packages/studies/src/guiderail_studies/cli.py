@@ -1,4 +1,4 @@
-"""Commands `study`, `ensemble`, `robustness`, `converge`, `certify`, `report` and `benchmark`."""
+"""Commands `study`, `ensemble`, `robustness`, `converge`, `passport`, `certify`, `report` and `benchmark`."""
 
 from importlib import import_module
 from pathlib import Path
@@ -135,7 +135,7 @@ def robustness(
 def converge(
     run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
     steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
-    engines: Annotated[str, option("Engines: drake and mujoco, comma-separated.")] = "drake",
+    engines: Annotated[str, option("Engines: drake, mujoco and pybullet, comma-separated.")] = "drake",
     episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
     seed: cli.Seed = cli.SEED,
     env: cli.Env = None,
@@ -174,6 +174,54 @@ def converge(
         typer.echo(f"coarsest step that agrees with the finest: {result['coarsest']:g} ms")
     if result["warning"]:
         typer.echo(f"warning: {result['warning']}")
+    typer.echo(result["table"])
+
+
+@cli.command("passport runs/connector")
+def passport(
+    run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
+    engines: Annotated[
+        str | None,
+        option("Engines: drake, mujoco and pybullet, comma-separated.  [default: those that are installed]"),
+    ] = None,
+    episodes: Annotated[int, option("Number of held-out episodes of each condition.")] = 20,
+    seed: cli.Seed = cli.SEED,
+    env: cli.Env = None,
+    out: Annotated[Path | None, option("Folder to write.  [default: passport in the run]")] = None,
+    processes: cli.Processes = None,
+    trust_policy: cli.TrustPolicy = False,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Evaluate a policy in several physics engines, at finer time steps, and with other friction and clearance.
+
+    The same held-out episodes run under every condition. The table has success rates with intervals, and the largest
+    forces of impedance and contact. The success in each engine is also predicted from the other engines. Evaluated
+    episodes are stored, so the same command resumes an interrupted evaluation.
+    """
+    from guiderail_studies.passport import passport as evaluate_passport
+
+    result = evaluate_passport(
+        run,
+        engines=engines,
+        episodes=episodes,
+        seed=seed,
+        environment=cli.parse_environment(env),
+        out=out,
+        log=print_message,
+        processes=processes,
+        trust_policy=trust_policy,
+    )
+    if as_json:
+        typer.echo(to_json(result | {"table": str(result["table"])}))
+        return
+    typer.echo(result["table"].with_suffix(".md").read_text(encoding="utf-8"))
+    for row in result["predictions"]:
+        typer.echo(
+            f"{row['left_out']}: {row['predicted']:.0%} predicted from the other engines ({row['low']:.0%} to "
+            f"{row['high']:.0%}), {row['measured']:.0%} measured"
+        )
+    typer.echo(f"weakest condition: {result['weakest']}")
     typer.echo(result["table"])
 
 

@@ -11,33 +11,71 @@ import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, exact_periods, plant_period
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.evaluate import check_num_episodes, evaluate_once
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import wilson
-from guiderail.tools.evaluation.subject import find_subject
+from guiderail.tools.evaluation.subject import Subject, find_subject
 from guiderail.tools.tables import write_table
 
 STEPS = (10.0, 5.0, 2.5, 1.25)  # default plant steps in Drake [ms]
-ENGINES = ("drake", "mujoco")
+ENGINES = {"drake": "Drake", "mujoco": "MuJoCo", "pybullet": "Bullet"}  # label of each engine
+ARM_OPTIONS = ("robot", "end_effector", "impedance_control")  # options that the stations of other engines lack
 EPISODES = 40  # default number of episodes of each condition
 MAX_DIFFERENCE = 0.05  # largest difference of success rates between a step and the finest one that agrees with it
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Engine, and plant step [ms] in Drake; MuJoCo has its own step."""
+    """Engine, step [ms] and options of an environment: the plant's step in Drake, in another engine its own.
+
+    A step of None is the engine's default. `change` describes further differences, such as the friction.
+    """
 
     engine: str
     step: float | None
     environment: Mapping[str, Any]
+    change: str = ""
 
     @property
     def name(self) -> str:
         """Name in the table."""
-        return "MuJoCo" if self.step is None else f"Drake, {self.step:g} ms"
+        step = "" if self.step is None else f"{self.step:g} ms"
+        return ", ".join(part for part in (ENGINES[self.engine], step, self.change) if part)
+
+    @property
+    def drake_step(self) -> float | None:
+        """Plant step in Drake [ms]; None in another engine."""
+        return self.step if self.engine == "drake" else None
+
+
+def parse_engines(text: str) -> list[str]:
+    """Return engines of a comma-separated text.
+
+    Raises:
+        InputError: If an engine is unknown, repeated, or not installed.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names or set(names) - set(ENGINES) or len(set(names)) < len(names):
+        raise InputError(f"--engines are {', '.join(ENGINES)}, comma-separated, not {brief(text)}")
+    for name in names:
+        if name != "drake":
+            require_extra(name)
+    return names
+
+
+def in_engine(engine: str, environment: Mapping[str, Any], step: float | None) -> Condition:
+    """Return the condition of an environment in an engine, with a step [ms] or None for the engine's default."""
+    if engine == "drake":
+        assert step is not None
+        station = {"station": "gantry"} if environment.get("station") in ENGINES else {}
+        kept = {name: value for name, value in environment.items() if name != "engine_step"}
+        return Condition(engine, step, {**kept, **station, "time_step": step / 1e3})
+    own = {} if step is None else {"engine_step": step / 1e3}
+    kept = {name: value for name, value in environment.items() if name not in (*ARM_OPTIONS, "time_step")}
+    return Condition(engine, step, {**kept, "station": engine, **own})
 
 
 def parse_steps(text: str) -> tuple[float, ...]:
@@ -62,24 +100,19 @@ def conditions(task: str, environment: Mapping[str, Any], steps: Sequence[float]
         InputError: If an engine is unknown, the task has no plant step or does not run in an engine, or a step does not
             divide the control period.
     """
-    names = [name.strip() for name in engines.split(",") if name.strip()]
-    if not names or set(names) - set(ENGINES):
-        raise InputError(f"--engines are {' and '.join(ENGINES)}, comma-separated, not {brief(engines)}")
+    names = parse_engines(engines)
     resolved = check_environment(task, environment)
     if "time_step" not in resolved:
         raise InputError(f"{task} on station={resolved.get('station')!r} has no time_step that could be refined")
-    found = []
-    if "drake" in names:
-        station = {"station": "gantry"} if resolved.get("station") == "mujoco" else {}
-        found = [Condition("drake", step, {**environment, **station, "time_step": step / 1e3}) for step in steps]
-    if "mujoco" in names:
-        arm_options = ("robot", "end_effector", "impedance_control")  # options that the station of MuJoCo lacks
-        kept = {name: value for name, value in environment.items() if name not in (*arm_options, "time_step")}
-        found.append(Condition("mujoco", None, {**kept, "station": "mujoco"}))
+    found = [
+        in_engine(name, environment, step)
+        for name in sorted(names, key=list(ENGINES).index)
+        for step in (steps if name == "drake" else [None])
+    ]
     for condition in found:
         changed = check_environment(task, condition.environment)
-        if condition.step is not None:
-            exact_periods(changed.get("control_period") or CONTROL_PERIOD, condition.step / 1e3)
+        if condition.drake_step is not None:
+            exact_periods(changed.get("control_period") or CONTROL_PERIOD, condition.drake_step / 1e3)
     return found
 
 
@@ -102,7 +135,7 @@ def converge(
     Args:
         policy: Run, or `pretrained:NAME`.
         steps: Plant steps in Drake [ms].
-        engines: "drake", "mujoco", or both, comma-separated.
+        engines: "drake", "mujoco" and "pybullet", comma-separated.
         episodes: Number of held-out episodes of each condition, with the same seeds.
         seed: Seed of the first episode.
         environment: Options of the environment that differ from training.
@@ -117,35 +150,26 @@ def converge(
     Raises:
         InputError: If there is no trained run, or an argument is invalid or missing.
     """
-    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
-    subject = find_subject(policy, None, environment, trust_policy=trust_policy)
+    subject, out = find_run(policy, environment, out, "converge", trust_policy=trust_policy)
     config = subject.config
     assert config is not None  # a run has one
-    if out is None:
-        if subject.folder is None or not subject.is_stored:
-            raise InputError("a policy without a folder needs one for the table: give --out")
-        out = subject.folder.path / "converge"
-    options = subject.changed_environment(dict(environment or {}))
-    found = conditions(config.task, options, steps, engines)
-    rows: list[dict[str, Any]] = []
-    outcomes: list[np.ndarray] = []
-    for number, condition in enumerate(found, start=1):
-        evaluated = evaluate_once(
-            out / "episodes", subject.name, config, subject.make_policy, condition.environment,
-            about=subject.digest, episodes=episodes, seed=seed, label=f"{number}/{len(found)} {condition.name}",
-            processes=processes,
-        )  # fmt: skip
-        if evaluated is None:
-            raise InputError(f"the policy does not fit the environment of {condition.name}: its spaces differ")
-        outcomes.append(evaluated["success"].to_numpy(dtype=bool))
-        rows.append({"condition": condition.name, "step_ms": condition.step, **_statistics(evaluated)})
-    reference = max((i for i, c in enumerate(found) if c.step is not None), default=0)
-    for row, outcome, condition in zip(rows, outcomes, found, strict=True):
-        row["agree_with_finest"] = int((outcome == outcomes[reference]).sum())
-        row |= _measure_contact(config.task, condition)
+    found = conditions(config.task, subject.changed_environment(dict(environment or {})), steps, engines)
+    evaluated = evaluate_conditions(subject, found, out, episodes=episodes, seed=seed, processes=processes)
+    outcomes = [table["success"].to_numpy(dtype=bool) for table in evaluated]
+    reference = max((i for i, c in enumerate(found) if c.drake_step is not None), default=0)
+    rows = [
+        {
+            "condition": condition.name,
+            "step_ms": condition.drake_step,
+            **success_and_force(table),
+            "agree_with_finest": int((outcome == outcomes[reference]).sum()),
+            **_measure_contact(config.task, condition),
+        }
+        for condition, table, outcome in zip(found, evaluated, outcomes, strict=True)
+    ]
     coarsest = coarsest_step(rows)
     table = write_table(out / "converge", rows).with_suffix(".csv")
-    trained = 1e3 * _trained_step(config.task, config.environment)
+    trained = 1e3 * plant_step(config.task, config.environment)
     warning = None
     if coarsest is not None and trained > coarsest * (1.0 + 1e-9):
         warning = (
@@ -153,6 +177,45 @@ def converge(
             f"{coarsest:g} ms (--env time_step={coarsest / 1e3:g})"
         )
     return {"table": table, "rows": rows, "coarsest": coarsest, "warning": warning}
+
+
+def find_run(
+    policy: Path | str, environment: Mapping[str, Any] | None, out: Path | None, name: str, *, trust_policy: bool
+) -> tuple[Subject, Path]:
+    """Return a run's policy, and the folder to write, by default `name` in the run.
+
+    Raises:
+        InputError: If there is no trained run, or a policy without a folder has no `out`.
+    """
+    subject = find_subject(policy, None, environment, trust_policy=trust_policy)
+    if out is None:
+        if subject.folder is None or not subject.is_stored:
+            raise InputError("a policy without a folder needs one for the table: give --out")
+        out = subject.folder.path / name
+    return subject, out
+
+
+def evaluate_conditions(
+    subject: Subject, found: Sequence[Condition], out: Path, *, episodes: int, seed: int, processes: int | None
+) -> list[pd.DataFrame]:
+    """Return the rows of the same held-out episodes under each condition, stored in the folder `out`.
+
+    Raises:
+        InputError: If an argument is invalid, or the policy does not fit an environment.
+    """
+    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
+    assert subject.config is not None  # a run has one
+    tables = []
+    for number, condition in enumerate(found, start=1):
+        evaluated = evaluate_once(
+            out / "episodes", subject.name, subject.config, subject.make_policy, condition.environment,
+            about=subject.digest, episodes=episodes, seed=seed, label=f"{number}/{len(found)} {condition.name}",
+            processes=processes,
+        )  # fmt: skip
+        if evaluated is None:
+            raise InputError(f"the policy does not fit the environment of {condition.name}: its spaces differ")
+        tables.append(evaluated)
+    return tables
 
 
 def coarsest_step(rows: Sequence[Mapping[str, Any]]) -> float | None:
@@ -169,15 +232,16 @@ def coarsest_step(rows: Sequence[Mapping[str, Any]]) -> float | None:
     return coarsest
 
 
-def _trained_step(task: str, environment: Mapping[str, Any]) -> float:
-    """Return the plant step of an environment [s]."""
+def plant_step(task: str, environment: Mapping[str, Any]) -> float:
+    """Return the plant step of an environment in Drake [s]."""
     from guiderail.diagrams.envs.config import EnvConfig
 
     config = EnvConfig.resolve(task, dict(environment))
     return float(environment.get("time_step") or plant_period(config.declared.workcell()))
 
 
-def _statistics(rows: pd.DataFrame) -> dict[str, Any]:
+def success_and_force(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return success with its interval, and the largest forces of the impedance and of the contact [N]."""
     successes = int(rows["success"].sum())
     low, high = wilson(successes, len(rows))
     return {
@@ -186,7 +250,7 @@ def _statistics(rows: pd.DataFrame) -> dict[str, Any]:
         "success_rate": successes / len(rows),
         "success_low": low,
         "success_high": high,
-        "peak_force": float(rows["peak_force"].max()),
+        **{name: float(rows[name].max()) for name in ("peak_force", "peak_contact_force")},
     }
 
 
@@ -200,6 +264,6 @@ def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     if getattr(made, "rim_contact", lambda: None)() is None:
         return dict.fromkeys(names)
     step = {} if condition.step is None else {"time_step": condition.step / 1e3}
-    probe = probe_contact(made, "gantry" if condition.engine == "drake" else "mujoco", **step)
+    probe = probe_contact(made, "gantry" if condition.engine == "drake" else condition.engine, **step)
     values = (*probe.drags, 1e3 * probe.lever, 1e3 * probe.capture, probe.cost)
     return dict(zip(names, (float(value) for value in values), strict=True))
