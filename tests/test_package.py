@@ -34,8 +34,8 @@ def packages(tmp_path_factory):
     with tarfile.open(archive) as file:
         file.extractall(build, filter="data")
     (sdist,) = (path for path in build.iterdir() if path.is_dir())
-    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", build, sdist]
-    subprocess.run(pip, check=True)
+    code = f"from setuptools import build_meta; build_meta.build_wheel({str(build)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=sdist, check=True)
     (wheel,) = build.glob("*.whl")
     installed = tmp_path_factory.mktemp("installed")
     zipfile.ZipFile(wheel).extractall(installed)

@@ -1,5 +1,7 @@
 """Driver of a simulated robot in the same process, with `read` and `write` only."""
 
+from functools import cache
+
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
@@ -12,6 +14,13 @@ from guiderail_hardware.station import HardwareStation
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 
 
+@cache
+def model_at_start():
+    """Return the model of the arm, and its joint positions at `START`, which take most of the construction."""
+    model = ArmControllerPlant(BncWorkcell())
+    return model, model.solve(START, model.posture)
+
+
 class DirectDriver(Driver):
     """Joints without gravity and friction that are integrated when a torque is written."""
 
@@ -21,8 +30,8 @@ class DirectDriver(Driver):
 
     def __init__(self, url=""):
         super().__init__(url)
-        self.model = ArmControllerPlant(BncWorkcell())
-        self.positions = self.model.solve(START, self.model.posture)
+        self.model, positions = model_at_start()
+        self.positions = positions.copy()
         self.velocities, self.time, self.torques = np.zeros(7), 0.0, []
 
     def read(self):

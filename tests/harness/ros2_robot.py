@@ -6,14 +6,16 @@ it then prints the number of targets, the last one, and the controllers that it 
 
 import heapq
 import json
+import multiprocessing
 import os
 import random
 import selectors
-import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -33,24 +35,35 @@ def use_loopback() -> None:
 
 
 class RobotProcess:
-    """Process that plays the robot at an address, with faults by name."""
+    """Process that plays the robot at an address, with faults by name; a fork, which saves seconds of imports."""
 
     def __init__(self, address: str, **faults: float):
-        command = [sys.executable, __file__, address, json.dumps(faults)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        context = multiprocessing.get_context("forkserver")
+        self._connection, child_end = context.Pipe()
+        uri = os.environ["CYCLONEDDS_URI"]
+        self._process = context.Process(target=_play_in_fork, args=(address, faults, uri, child_end), daemon=True)
+        self._process.start()
+        child_end.close()
 
     def end(self) -> dict:
         """End the process and return what it received."""
-        output, _ = self._process.communicate("\n", timeout=60)
-        return json.loads(output)
+        self._connection.send(None)
+        assert self._connection.poll(60)
+        return self._connection.recv()
 
     def kill(self) -> None:
         """Kill the process."""
         self._process.kill()
-        self._process.communicate()
+        self._process.join()
 
 
-def main(address: str, faults: dict) -> None:
+def _play_in_fork(address: str, faults: dict, uri: str, connection: Connection) -> None:
+    os.environ["CYCLONEDDS_URI"] = uri
+    connection.send(play(address, faults, connection))
+
+
+def play(address: str, faults: dict, stop: TextIO | Connection) -> dict:
+    """Play the robot until `stop` can be read; return the received targets and requests."""
     from guiderail_hardware.drivers.ros2 import Ros2Address, Ros2Bus
 
     bus = Ros2Bus(Ros2Address.parse(address), robot_side=True)
@@ -60,7 +73,7 @@ def main(address: str, faults: dict) -> None:
     received: dict = {"targets": 0, "last": None, "switched": [], "replies": 0}
     start, number = time.time(), 0
     selector = selectors.DefaultSelector()
-    selector.register(sys.stdin, selectors.EVENT_READ)
+    selector.register(stop, selectors.EVENT_READ)
     while not selector.select(timeout=2e-3):
         now = time.time()
         if now - start > number * PERIOD and not (faults.get("silent_after") and now - start > faults["silent_after"]):
@@ -94,8 +107,8 @@ def main(address: str, faults: dict) -> None:
             received["switched"].append(list(request.activate_controllers))
             refused = faults.get("refuses", False)
             bus.responses.write(messages.SwitchControllerResponse(request.guid, request.number, not refused, "refused"))
-    print(json.dumps(received))
+    return received
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], json.loads(sys.argv[2]))
+    print(json.dumps(play(sys.argv[1], json.loads(sys.argv[2]), sys.stdin)))

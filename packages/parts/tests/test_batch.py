@@ -11,7 +11,7 @@ pytest.importorskip("manifold3d")
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-from guiderail_parts import batch, contact
+from guiderail_parts import batch, contact, contact_map
 from guiderail_parts.batch import create_tasks, create_with_shrink
 from guiderail_parts.geometry import demonstrator
 from guiderail_parts.geometry.assembly_check import OverlapError
@@ -22,6 +22,9 @@ from oracles.parts import PARTS
 def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])  # three demonstrations
     monkeypatch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
+    monkeypatch.setattr(contact_map, "TOUCHES", 4)
+    monkeypatch.setattr(contact, "MAX_TRIALS", 1)
+    monkeypatch.setattr(contact, "MIN_SPEED", 0.0)  # no further trials on a slow machine
     meshes, out = tmp_path / "meshes", tmp_path / "parts"
     for name in ("good", "bad"):
         (meshes / name).mkdir(parents=True)

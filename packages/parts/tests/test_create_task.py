@@ -23,8 +23,9 @@ from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.train import train
+from guiderail.tools.visualization import figures, replay
+from guiderail_parts import contact, contact_map, difficulty, trial
 from guiderail_parts import create_task as create_task_module
-from guiderail_parts import trial
 from guiderail_parts.contact import rank
 from guiderail_parts.create_task import ask_unit, create_task, read_parts
 from guiderail_parts.geometry import demonstrator
@@ -46,6 +47,7 @@ pytest.importorskip("manifold3d")
 from oracles.parts import PARTS, screw
 
 RUN = {}
+SMALL_LEARNER = "--set", "net_arch=8", "--set", "gradient_steps=1"
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +68,10 @@ def folder(tmp_path_factory):
     """Return the task folder of a square peg, the part of `learn_parts.py` that is simulated fastest."""
     parent = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(parent)
-    call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contact_map, "TOUCHES", 30)  # enough to find the socket of this peg
+        patch.setattr(contact, "MIN_SPEED", 0.0)
+        call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
     yield parent / "peg"
     # The task must not be registered in other tests.
     for name in [name for name in TASKS.names() if name.startswith("parts/")]:
@@ -154,8 +159,10 @@ def test_task_of_a_study_may_be_a_task_folder(folder, tmp_path, monkeypatch):
     assert (study.task, study.imports) == ("parts/peg", (str(folder.resolve()),))
 
 
-def test_training_on_a_created_task_writes_its_page(folder, tmp_path):
-    call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
+def test_training_on_a_created_task_writes_its_page(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(replay, "EPISODES", 1)
+    monkeypatch.setattr(figures, "LAYOUT", None)
+    call("train", folder, "--episodes", 1, *SMALL_LEARNER, "--out", tmp_path / "run", "--json")
     assert (tmp_path / "run/replay.html").is_file()
 
 
@@ -182,11 +189,11 @@ def test_difficulties_of_a_created_task_bound_offset_command(folder):
     hard = yaml.safe_load((folder / "task.yaml").read_text())["hard"]
     (low, high), turn = hard["offset_range"], hard["fixture_turn"]
     assert 0.0 < turn < 2.0  # [°]; 0.1 mm of clearance at a radius of 7 mm is 0.8°
-    for difficulty, is_inside, bound in (
+    for name, is_inside, bound in (
         ("hard", lambda x, y, z: low <= np.hypot(x, y) <= high and abs(z) <= np.deg2rad(turn), hard["bound"]),
         ("automate", lambda x, y, z: max(abs(x), abs(y)) <= 2e-3 and abs(z) <= np.deg2rad(5.0), 3.5e-3),
     ):
-        task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).declared
+        task = EnvConfig.resolve(str(folder), {"difficulty": name}).declared
         rng = np.random.default_rng(0)
         offsets = np.array([task.offsets.draw(rng, InsertionReset(), RUN)[0] for _ in range(200)])
         assert all(is_inside(*offset) for offset in offsets)
@@ -332,12 +339,15 @@ def test_scripted_search_follows_the_plug_below_the_rim(folder):
 
 
 @contextmanager
-def few_demonstrations():
-    """Record three demonstrations instead of ten."""
+def few_demonstrations(number=3):
+    """Record few demonstrations instead of ten, touch 4 times for the contact map, and try one setting of a contact."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])
-        patch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
-        patch.setattr(create_task_module, "NUM_DEMONSTRATIONS", 3)
+        patch.setattr(contact, "MAX_TRIALS", 1)
+        patch.setattr(contact, "MIN_SPEED", 0.0)  # no other contact is tried on a slow machine
+        patch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:number])
+        patch.setattr(demonstrator, "NUM_DEMONSTRATIONS", number)
+        patch.setattr(create_task_module, "NUM_DEMONSTRATIONS", number)
+        patch.setattr(contact_map, "TOUCHES", 4)
         yield
 
 
@@ -346,7 +356,9 @@ def turning(tmp_path_factory):
     """Return the task folder of the square peg with an unknown turn of the socket of up to 4.5°."""
     parent = tmp_path_factory.mktemp("turning")
     plug, socket = PARTS["square_peg"]().write(parent)
-    with few_demonstrations():
+    with few_demonstrations(), pytest.MonkeyPatch.context() as patch:
+        # The first setting is accepted without episodes.
+        patch.setattr(difficulty, "score_setting", lambda *arguments: difficulty.Score(0, 1, 1, 1))
         create_task(plug, socket, parent / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
     return parent / "turning_peg"
 
@@ -382,9 +394,9 @@ def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
 def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
     part = screw()
     arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
-    with few_demonstrations():
+    with few_demonstrations(2):
         call("create-task", *arguments, *part.options)
-    assert "3 of 3" in capsys.readouterr().out
+    assert "2 of 2" in capsys.readouterr().out
     file = read_task_file(tmp_path / "screw")
     assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
     assert file.measured["inserted"]
@@ -621,8 +633,7 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     shutil.copytree(folder, other)
     text = (other / "task.yaml").read_text()
     (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
-    options = "--set", "net_arch=8", "--set", "gradient_steps=1", "--set", "demonstration_episodes=1"
-    options = *options, "--no-pictures", "--out", tmp_path / "run"
+    options = *SMALL_LEARNER, "--set", "demonstration_episodes=1", "--no-pictures", "--out", tmp_path / "run"
     call("train", folder, other, "--episodes", 2, "--evaluate", 1, *options, "--json")
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out_episodes"] == 2
     run = RunFolder(tmp_path / "run")

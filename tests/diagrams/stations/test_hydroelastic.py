@@ -6,26 +6,24 @@ import pytest
 from guiderail import make_env
 
 DOWN = np.array([0.0, 0.0, -1.0])
-# Task, options, action, and options of the reset.
+# Task, options and action.
 CASES = {
-    "connector": ("BncConnector", {"guidance": "kmp", "fixture_offset": "none"}, np.zeros(2), {}),
+    "connector": ("BncConnector", {"guidance": "kmp"}, np.zeros(2)),
     "connector with a Cartesian controller": (
         "BncConnector",
-        {"guidance": "kmp", "fixture_offset": "none", "impedance_control": "cartesian"},
+        {"guidance": "kmp", "impedance_control": "cartesian"},
         np.zeros(2),
-        {},
     ),
-    "connector on an arm": ("BncConnector", {"guidance": "kmp", "station": "arm"}, np.zeros(2), {"offset": (0.0, 0.0)}),
-    "clamp": ("GridClamp", {"fixture_offset": "none"}, DOWN, {}),
-    "clamp on an arm": ("GridClamp", {"station": "arm", "fixture_offset": "none"}, DOWN, {}),
+    "clamp": ("GridClamp", {}, DOWN),
+    "clamp on an arm": ("GridClamp", {"station": "arm"}, DOWN),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_insertion_has_no_point_contact(case):
-    task, options, action, reset_options = CASES[case]
-    env = make_env(task, **options)
-    env.reset(seed=0, options=reset_options)
+    task, options, action = CASES[case]
+    env = make_env(task, fixture_offset="none", **options)
+    env.reset(seed=0)
     plant = env.diagram.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
     surfaces, points, has_ended = 0, 0, False

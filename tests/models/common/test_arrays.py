@@ -4,28 +4,21 @@ import pytest
 from guiderail.models.common.arrays import as_number, as_numbers, is_whole
 from guiderail.models.common.errors import InputError
 
-
-@pytest.mark.parametrize(
-    "values",
-    [[2**53], [2**63], [2**64], [0.5, 2**70], np.array([1, 2**60], dtype=object), [0.5, -(2**53)]]
-    + [[[2**53 + 1], [0.5]], [np.int64(2**53), np.inf], [np.array([2**53]), np.array([0.5])]],
-)
-def test_as_numbers_refuses_integers_that_a_double_rounds(values):
-    with pytest.raises(InputError, match="the lengths holds whole numbers"):
-        as_numbers(values, "the lengths")
+ROUNDED = [[2**53], [2**63], [2**64], [0.5, 2**70], np.array([1, 2**60], dtype=object), [0.5, -(2**53)]]
+ROUNDED += [[[2**53 + 1], [0.5]], [np.int64(2**53), np.inf], [np.array([2**53]), np.array([0.5])]]
+DIGITS = [["1.5", "2"], np.array(["1.5", 2.0], dtype=object), np.array([b"3", 1], dtype=object)]
 
 
 @pytest.mark.parametrize(
-    "values", [["1.5", "2"], np.array(["1.5", 2.0], dtype=object), np.array([b"3", 1], dtype=object)]
+    ("values", "message"),
+    [
+        *((values, " holds whole numbers") for values in ROUNDED),
+        *((values, " is not an array of numbers") for values in DIGITS),
+        *((values, " is not an array of numbers: it holds None") for values in (None, [None, 1.0])),
+    ],
 )
-def test_as_numbers_refuses_text_of_digits(values):
-    with pytest.raises(InputError, match="the lengths is not an array of numbers"):
-        as_numbers(values, "the lengths")
-
-
-@pytest.mark.parametrize("values", [None, [None, 1.0]])
-def test_as_numbers_refuses_none(values):
-    with pytest.raises(InputError, match="the lengths is not an array of numbers: it holds None"):
+def test_as_numbers_refuses_rounded_integers_text_and_none(values, message):
+    with pytest.raises(InputError, match=f"the lengths{message}"):
         as_numbers(values, "the lengths")
 
 

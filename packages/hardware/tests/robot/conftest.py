@@ -1,5 +1,8 @@
 """Executor of a skill with a simulated robot, both in one process."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from injections.stepped_robot import SteppedRobotClock
@@ -7,10 +10,27 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
+from guiderail_hardware.drivers.driver import safety_limits
 from guiderail_hardware.robot.executor import SkillExecutor
 from guiderail_hardware.robot.sim_driver import START
 
 OPTIONS = {"station": "hardware", "guidance": "kmp", "fixture_offset": "none"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def shorten_pauses():
+    """Shorten the ramp of the torques and the end of an approach, which are most of the simulated time.
+
+    Collections of garbage between episodes are left out, because they would traverse the objects of all tests.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "guiderail_hardware.station.safety_limits",
+            lambda plant, driver: replace(safety_limits(plant, driver), ramp_time=0.1),
+        )
+        patch.setattr("guiderail_hardware.robot.preflight.SETTLING_TIME", 0.1)
+        patch.setattr("guiderail_hardware.robot.robot_env.gc", SimpleNamespace(collect=lambda: 0))
+        yield
 
 
 @pytest.fixture

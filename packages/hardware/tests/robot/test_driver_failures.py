@@ -14,7 +14,7 @@ def scalar_status():
     return JointStatus(1.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("step", [200, 370])  # during the approach, and during the skill
+@pytest.mark.parametrize("step", [120, 210])  # during the approach, and during the skill
 @pytest.mark.parametrize(
     ("method", "replacement", "fault", "reason"),
     [
@@ -30,7 +30,7 @@ def test_arm_rests_when_the_driver_fails(make_executor, step, method, replacemen
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (fault, 1)
     assert reason in outcome.description
-    assert (outcome.steps > 0) == (step == 370)
+    assert (outcome.steps > 0) == (step == 210)
     assert max_joint_speed(clock) < 0.02
     assert clock.step >= step + 60  # the station continues until the arm is at rest
 
@@ -76,7 +76,7 @@ def test_failed_commands_are_reported_and_retried(make_executor):
         attempts.append(clock.step)
         unplugged()
 
-    clock.happens[200] = lambda: setattr(driver, "write", write)
+    clock.happens[120] = lambda: setattr(driver, "write", write)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (Fault.COMMAND_FAILED, 1)
     assert outcome.description.startswith(
@@ -117,7 +117,7 @@ def test_first_exception_is_raised_when_commands_fail_as_well(make_executor):
         executor._station.driver.write = unplugged
         raise KeyboardInterrupt
 
-    clock.happens[200] = lambda: executor._simulator.set_monitor(interrupt)
+    clock.happens[120] = lambda: executor._simulator.set_monitor(interrupt)
     with pytest.raises(KeyboardInterrupt):
         executor.run(messages.append)
     assert "commands that bring the arm to rest could not be sent: write raised OSError" in messages[-1]
