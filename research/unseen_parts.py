@@ -43,9 +43,11 @@ CONDITIONS = {
     "center_of_pressure": ENVIRONMENT | {"observation": "center_of_pressure"},  # for a search without a contact map
 }
 FEW_SHOT = (10, 20, 40, 80)  # training episodes after which a specialist is evaluated
+ENOUGH = 0.95  # success rate with which its training ends
 DEMONSTRATED = {"demonstration_episodes": 5, "demonstration_fraction": 0.5, "exploration.constant_episodes": 0}
 """Settings of a specialist to which the general policy demonstrates: RLPD (Ball et al., 2023)."""
 SETTINGS = {"symmetry": "near", "exploration.constant_episodes": 12}
+CALIBRATED = 10  # episodes that calibrate `difficulty=hard` of each held-out part
 EASY_RANDOM, EASY_SEARCH = 0.2, 0.9  # success rates above which a part cannot show learning
 
 
@@ -60,14 +62,16 @@ def split_parts(names: Iterable[str]) -> tuple[list[str], list[str]]:
     return ordered[number:], ordered[:number]
 
 
-def prepare(pairs: Mapping[str, Pair], names: Sequence[str], number: int, out: Path, processes: int) -> list[Path]:
+def prepare(
+    pairs: Mapping[str, Pair], names: Sequence[str], number: int, out: Path, processes: int, hard_episodes: int
+) -> list[Path]:
     """Return the first `number` task folders that can be created, in the order of `names`."""
     folders: list[Path] = []
     for start in range(0, len(names), processes):
         if len(folders) >= number:
             break
         chunk = [pairs[name] for name in names[start : start + processes]]
-        results = create_tasks(chunk, out, processes=processes, log=report)
+        results = create_tasks(chunk, out, processes=processes, log=report, hard_episodes=hard_episodes)
         folders += [out / name for name, result in results.items() if "error" not in result]
     return folders[:number]
 
@@ -107,13 +111,18 @@ def evaluate_part(
 
 
 def learn_few_shot(part: Path, general: Path, seed: int, evaluated: int, out: Path) -> None:
-    """Evaluate specialists of a part after each of `FEW_SHOT` training episodes, from scratch and demonstrated to."""
+    """Train specialists of a part from scratch and demonstrated to, until one evaluation reaches `ENOUGH`.
+
+    They are evaluated after each of `FEW_SHOT` training episodes.
+    """
     for name, settings in (("scratch", {}), ("demonstrated", DEMONSTRATED | {"demonstrator": str(general)})):
         for episodes in FEW_SHOT:
-            if (out / "rows/hard" / f"{name}-{episodes}" / f"{part.name}.csv").exists():
-                continue
-            run = train_once([part], out / "runs" / f"{name}-{part.name}", seed, episodes, settings)
-            evaluate_part(part, {f"{name}-{episodes}": run}, evaluated, out)
+            file = out / "rows/hard" / f"{name}-{episodes}" / f"{part.name}.csv"
+            if not file.exists():
+                run = train_once([part], out / "runs" / f"{name}-{part.name}", seed, episodes, settings)
+                evaluate_part(part, {f"{name}-{episodes}": run}, evaluated, out)
+            if read_table(file)["success"].mean() >= ENOUGH:
+                break
 
 
 def tabulate(rows: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -181,10 +190,13 @@ def main(arguments: list[str]) -> None:
     write_atomically(file, json.dumps(split, indent=1).encode())
     tasks = out / "tasks" if args.prepared is None else args.prepared.resolve()
     held_out, training = (
-        prepare(pairs, names, number, tasks, args.processes)
+        prepare(pairs, names, number, tasks, args.processes, hard_episodes)
         if args.prepared is None
         else prepared(tasks, names, number)
-        for names, number in ((held_out_names, args.held_out), (training_names, args.training))
+        for names, number, hard_episodes in (
+            (held_out_names, args.held_out, CALIBRATED),
+            (training_names, args.training, 0),  # a calibration costs more than the rest of the preparation
+        )
     )
     used = {"training": [part.name for part in training], "held_out": [part.name for part in held_out]}
     write_atomically(out / "parts.json", json.dumps(used, indent=1).encode())

@@ -13,7 +13,7 @@ import yaml
 from guiderail.diagrams.envs.config import EnvConfig, stations_of
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.diagrams.tasks.insertion import CENTER_OF_PRESSURE_SCALE, InsertionReset
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as common_files
 from guiderail.models.common.errors import InputError
@@ -27,6 +27,7 @@ from guiderail.tools.visualization import figures, replay
 from guiderail_parts import contact, contact_map, difficulty, trial
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts.contact import rank
+from guiderail_parts.contact_map import ContactMap
 from guiderail_parts.create_task import ask_unit, create_task, read_parts
 from guiderail_parts.geometry import demonstrator
 from guiderail_parts.task import (
@@ -720,13 +721,29 @@ def test_without_a_contact_map_the_socket_stays_uncertain(folder, tmp_path):
     env.close()
 
 
+def test_shared_observation_has_the_center_of_pressure_with_the_sign_of_the_part(folder):
+    env, other = shared(folder), shared(folder, observation="center_of_pressure")
+    assert read_task_file(folder).search.lever_sign == -1
+    for each in (env, other):
+        each.reset(seed=1)
+    centers = []
+    for _ in range(30):
+        centers.append((env.step(np.zeros(2))[0][28:30], other.step(np.zeros(2))[0][13:15]))
+    ours, known = np.moveaxis(centers, 1, 0)
+    assert np.abs(known).max() > 0.5
+    lever = np.sqrt((ContactMap.load(folder / "contact_map.csv").centers ** 2).mean())
+    np.testing.assert_allclose(ours, np.clip(-known * CENTER_OF_PRESSURE_SCALE / lever, -3, 3), atol=1e-5)
+    env.close()
+    other.close()
+
+
 def test_shared_observation_has_the_symmetries_of_the_part(folder):
     env, other = shared(folder), shared(folder, observation="center_of_pressure")
     symmetry, known = env.diagram.near_symmetry.observations, other.diagram.near_symmetry.observations
     np.testing.assert_array_equal(symmetry[:, :10, :10], known[:, :10, :10])  # time, pose and force
     for matrix, by_center in zip(symmetry, known, strict=True):
         across = by_center[13:15, 13:15]
-        for start in (11, 13, 16, 19, 22):  # estimate, command, distance from the command, progress
+        for start in (11, 13, 16, 19, 22, 28):  # estimate, command, distance from it, progress, center of pressure
             np.testing.assert_array_equal(matrix[start : start + 2, start : start + 2], across)
         assert (np.diag(matrix)[[10, 15, 18, 21, 24]] == 1).all()
         xx, xy, yy = matrix[25:28, 25:28] @ [3.0, 0.5, 1.0]

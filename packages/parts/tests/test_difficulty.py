@@ -21,7 +21,7 @@ from guiderail_parts.difficulty import (
     force_limit_of,
     turn_of,
 )
-from guiderail_parts.task_file import MotionNumbers
+from guiderail_parts.task_file import MotionNumbers, PartTaskFile
 
 
 def make_score(random, scripted):
@@ -118,12 +118,16 @@ def test_episode_is_truncated_when_the_plug_is_on_the_rim():
     assert [env.step(None)[3] for _ in rows] == [False, False, True]
 
 
-def test_failed_calibration_returns_the_unchanged_file(tmp_path):
+def test_without_a_calibration_hard_is_the_first_setting_with_the_limits_of_the_part(tmp_path):
     messages = []
     motion = MotionNumbers(travel=0.010, first_contact=0.007)
-    file = SimpleNamespace(measured={"force": 5.0}, clearance=0.0, force_limit=35.0, motion=motion)
-    assert calibrate(tmp_path / "missing", file, 1e-2, 2, messages.append) is file
-    assert messages[0].startswith("difficulty=hard is not calibrated: there is no task folder")
+    file = PartTaskFile.model_construct(measured={"force": 5.0, "clearance_mm": 1.0}, force_limit=35.0, motion=motion)
+    for episodes in (0, 2):  # no calibration, and one that fails
+        result = calibrate(tmp_path / "missing", file, 20e-3, episodes, messages.append)
+        assert result.hard == SETTINGS[FIRST].options(13.0, 2.86)  # 2.5 times the force; 1 mm over 20 mm [degrees]
+        assert "hard" not in result.measured
+    (message,) = messages
+    assert message.startswith("difficulty=hard is not calibrated: there is no task folder")
 
 
 @pytest.mark.parametrize("episodes", [-1, 101])

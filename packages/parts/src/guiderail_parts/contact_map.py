@@ -91,6 +91,11 @@ class ContactMap:
         np.savetxt(text, rows, fmt="%.4f", delimiter=",", header=",".join(COLUMNS), comments="")
         write_atomically(path, text.getvalue().encode())
 
+    @property
+    def lever(self) -> float:
+        """Root mean square of the coordinates of all centers of pressure, at least `MIN_DEVIATION` [m]."""
+        return max(float(np.sqrt((self.centers**2).mean())), MIN_DEVIATION)
+
     @cached_property
     def _regression(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Positions, tilts, centers and terms of the used samples, and the variance of all centers [m²].
@@ -164,14 +169,15 @@ def measure_contact_map(station: Station, motion: MotionNumbers, seed: int = 0) 
     builder.Connect(source.get_output_port(), station.get_desired_pose_input_port())
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
+    initial = context.Clone()
     measured = station.GetMyContextFromRoot(context)
     command = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
     samples = []
     for _ in range(TOUCHES):
         first, last = _draw_slide(rng, turn)
         depth, slid, height = rng.uniform(MIN_PRESS, 1.0) * motion.press, 0.0, motion.travel
+        context.SetTimeStateAndParametersFrom(initial)  # without the filtered wrench of the last touch
         command.set_value(np.insert(first, 2, height))
-        context.SetTime(0.0)
         station.set_pose(context, np.insert(first, 2, height))
         simulator.Initialize()
         while slid <= SLIDE and context.get_time() < LOWERING + slid:

@@ -441,14 +441,14 @@ def _write_task(
     fitted = file.demonstrations.model_copy(update={"components": num_components(folder, file)})
     file = file.model_copy(update={"measured": measured, "demonstrations": fitted})
     write_task_file(folder, file)
+    mesh = read_obj(folder / file.plug.visual)
+    radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
     if hard_episodes:
-        mesh = read_obj(folder / file.plug.visual)
-        radius = float(np.hypot(*mesh.vertices[mesh.triangles].reshape(-1, 3)[:, :2].T).max())
         log("calibrating difficulty=hard: several times as long as the demonstrations; --hard-episodes 0 leaves it out")
-        file = calibrate(folder, file, radius, hard_episodes, log)
-        if "hard" in file.measured:
-            file.measured["hard"]["seconds"] = round(_seconds_since(start) - measured["total_s"], 2)
-        write_task_file(folder, file)
+    file = calibrate(folder, file, radius, hard_episodes, log)
+    if "hard" in file.measured:
+        file.measured["hard"]["seconds"] = round(_seconds_since(start) - measured["total_s"], 2)
+    write_task_file(folder, file)
     write_preview(folder / "preview.html", folder, file, choice.aligned)
     return file.measured
 

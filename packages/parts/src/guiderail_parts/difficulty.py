@@ -201,19 +201,23 @@ def turn_of(clearance: float, radius: float) -> float:
 def calibrate(
     folder: Path, file: PartTaskFile, radius: float, episodes: int, log: Callable[[str], None]
 ) -> PartTaskFile:
-    """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
+    """Return the task file with options `hard` and the results of their calibration.
 
-    If no setting has the required success rates, the options of the best setting are used.
+    If no setting has the required success rates, the options of the best setting are used. Without a calibration, and
+    if it fails, they are those of the setting that a calibration tries first.
 
     Args:
         folder: Task folder, which must contain `file`.
         file: Task file.
         radius: Largest distance of the plug from the axis [m].
-        episodes: Largest number of episodes of each policy with each setting.
+        episodes: Largest number of episodes of each policy with each setting; 0: no calibration.
         log: Function called with a sentence on the result.
     """
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = file.motion.search_turn or turn_of(file.clearance, radius)
+    first = file.model_copy(update={"hard": SETTINGS[FIRST].options(force_limit, turn)})
+    if not episodes:
+        return first
     try:
         read_task_file(folder).demonstrations.reference(folder)  # fits the written file; the child inherits the cache
         setting, score, is_hard = run_isolated(
@@ -221,7 +225,7 @@ def calibrate(
         )
     except (IsolatedError, InputError) as error:
         log(f"difficulty=hard is not calibrated: {error}")
-        return file
+        return first
     demonstrations = Demonstrations.load(folder / file.demonstrations.file)
     seconds = float(np.mean([times[-1] - times[0] for times in demonstrations.times]))
     options = setting.options(force_limit, turn)

@@ -233,10 +233,11 @@ class PartInsertion(DemonstratedInsertion):
 
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
     a policy of many parts: forces relative to the force limit, and lateral positions relative to the reach of an
-    action. In place of the center of pressure, whose direction depends on the part, it has the socket's axis as
-    `SocketEstimator` estimates it, and the covariance of this estimate. Further entries are the height above the
-    measured first contact, the distance of the plug from the command (laterally relative to the clearance), and the
-    plug's progress in the last 0.2 and 0.6 s, which shows whether anything moves.
+    action. The direction from the center of pressure to the socket's axis depends on the part: it has the center with
+    the part's sign, relative to its distance in the contact map, and the axis that `SocketEstimator` estimates with
+    this map, with the covariance of the estimate. Further entries are the height above the measured first contact, the
+    distance of the plug from the command (laterally relative to the clearance), and the plug's progress in the last 0.2
+    and 0.6 s, which shows whether anything moves.
     """
 
     workpiece, fixture = PLUG, SOCKET
@@ -379,6 +380,7 @@ class PartInsertion(DemonstratedInsertion):
         half, reach, file = 0.5 * self.duration, self._reach, self.file
         scale[:2] = reach
         lag, forces = np.array([*[SLIDING + file.clearance] * 2, NEAR]), WRENCH_SCALE[list(FORCES)]
+        lever = CENTER_OF_PRESSURE_SCALE if self._contact_map is None else self._contact_map.lever
         terms = (
             ObservationTerm("time", half, half),
             ObservationTerm("pose", center, scale),
@@ -389,6 +391,7 @@ class PartInsertion(DemonstratedInsertion):
             ObservationTerm("lag", 0.0, lag),
             ObservationTerm("progress", 0.0, PROGRESS),
             ObservationTerm("socket_offset", 0.0, UNCERTAINTY**2, (2, 3, 4)),
+            ObservationTerm("center_of_pressure", 0.0, file.search.lever_sign * lever),
             *self.force_limit_terms(),
         )
         return Observed(terms, privileged=PRIVILEGED)
@@ -490,7 +493,7 @@ def _shared_side(pose: np.ndarray) -> np.ndarray:
     covariance = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]])
     force = block_diag(across, np.eye(2))
     progress = [moved] * len(DELAYS)
-    return np.asarray(block_diag(np.eye(1), pose, force, across, across, np.eye(1), moved, *progress, covariance))
+    return np.asarray(block_diag(np.eye(1), pose, force, across, across, np.eye(1), moved, *progress, covariance, across))
 
 
 SHARED_SIZE = len(_shared_side(np.eye(POSE_SIZE)))
