@@ -310,7 +310,4 @@ class BulletStation(EngineStation):
     ):
         """Construct the station; see `MujocoStation` for arguments and errors, and `BulletEngine` for its limits."""
         step = STEP if engine_step is None else engine_step
-        super().__init__(
-            "pybullet", partial(BulletEngine, step=step), workcell, impedance, time_step,
-            control_period,
-        )  # fmt: skip
+        super().__init__("pybullet", partial(BulletEngine, step=step), workcell, impedance, time_step, control_period)
