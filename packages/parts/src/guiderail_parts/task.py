@@ -493,7 +493,8 @@ def _shared_side(pose: np.ndarray) -> np.ndarray:
     covariance = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]])
     force = block_diag(across, np.eye(2))
     progress = [moved] * len(DELAYS)
-    return np.asarray(block_diag(np.eye(1), pose, force, across, across, np.eye(1), moved, *progress, covariance, across))
+    blocks = [np.eye(1), pose, force, across, across, np.eye(1), moved, *progress, covariance, across]
+    return np.asarray(block_diag(*blocks))
 
 
 SHARED_SIZE = len(_shared_side(np.eye(POSE_SIZE)))
