@@ -16,9 +16,9 @@ CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
 @pytest.fixture(scope="module")
 def probes():
-    """Return the connector's contact at its default step and at a quarter of it."""
+    """Return the connector's contact at its default step and at half of it."""
     step = CONNECTOR.workcell().time_step
-    return [probe_contact(CONNECTOR, time_step=step / division) for division in (1, 4)]
+    return [probe_contact(CONNECTOR, time_step=step / division) for division in (1, 2)]
 
 
 def test_contact_of_the_connector_has_converged_at_the_default_step(probes):

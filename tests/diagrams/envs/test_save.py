@@ -59,7 +59,7 @@ def test_rest_of_an_episode_is_equal_bit_for_bit_when_restored(task, options):
 
 
 def test_interruption_changes_nothing_when_the_episode_continues():
-    env, actions = begin(*CASES[0])
+    env, actions = begin(*CASES[0], count=12)
     expected = steps(env, actions)
     env.reset(seed=3)
     results = []

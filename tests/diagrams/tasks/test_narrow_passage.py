@@ -196,12 +196,12 @@ def measuring():
     return make("skgrl", history={"length": 1, "source": "measured"})
 
 
-@pytest.mark.parametrize("step", [10, 20, 45])
-@pytest.mark.parametrize("push", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.03)])
+@pytest.mark.parametrize(
+    ("step", "push"),
+    [(10, (-0.1, 0.0)), (10, (0.0, 0.03)), (20, (0.1, 0.0)), (45, (0.01, 0.0)), (45, (0.0, 0.03))],
+)
 def test_command_continues_at_the_pushed_pose(step, push, measuring):
     """Section 5.3.4: with P = 1 the history is the measured pose, so the command continues at the robot."""
-    if step == 45 and push[1] == 0.0:
-        push = (0.01 * np.sign(push[0]), 0.0)  # free space to the walls [m]
     env = measuring
     env.reset()
     info = {"termination": ""}

@@ -7,12 +7,19 @@ from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
 
+from hypothesis import settings
+
 MAX_SECONDS = 2.0  # largest CPU time of an input [s]
 MAX_BYTES = 200_000_000  # largest growth of memory by an input [bytes]
 TIMEOUT = 300  # wall-clock time after which a process that ignores signals is ended [s]
 
 COUNTS: Counter[tuple[str, str]] = Counter()
 measuring = False  # only fuzz.py checks the limits
+
+
+def few_inputs(test):
+    """Try ten inputs among the other tests; `make fuzz` and the profile "long" try many."""
+    return settings(max_examples=10)(test) if settings().max_examples <= 30 else test
 
 
 class TooSlowError(BaseException):

@@ -6,7 +6,7 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fuzz.tally import attempt
+from fuzz.tally import attempt, few_inputs
 from guiderail.diagrams.envs.config import EnvConfig, option_models
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import option_fields
@@ -50,6 +50,7 @@ BOMB = (
 SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "algorithm"]
 
 
+@few_inputs
 @given(
     st.sampled_from(sorted(PRESETS)),
     st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), TEXTS), min_size=1, max_size=2),
@@ -102,6 +103,7 @@ def environments(draw):
     return task, texts
 
 
+@few_inputs
 @given(environments())
 @example(("NarrowPassage", {"action_repeat": BOMB}))
 @example(("NarrowPassage", {"action_repeat": "2001-99-99"}))
@@ -138,6 +140,7 @@ def env(request):
     env.close()
 
 
+@few_inputs
 @given(st.data())
 def test_reset_accepts_or_refuses_any_option(env, data):
     task = env.diagram.task.name

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fuzz.changes import bit_flips, edited, edits, flipped
-from fuzz.tally import attempt
+from fuzz.tally import attempt, few_inputs
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrations import MAX_MAGNITUDE
@@ -61,6 +61,7 @@ def assert_exact_or_refused(target: str, path: Path, read) -> None:
 
 
 @pytest.mark.parametrize("ending", ["npz", "csv"])
+@few_inputs
 @given(demonstrations())
 def test_demonstrations_round_trip_is_bit_exact(folder, ending, saved):
     path = folder / f"round.{ending}"
@@ -105,6 +106,7 @@ def members(draw):
     return {key: np.asfortranarray(array) if draw(st.booleans()) else array for key, array in arrays.items()}
 
 
+@few_inputs
 @given(members(), st.booleans())
 def test_npz_with_any_arrays_is_exact_or_refused(folder, arrays, compressed):
     path = folder / "arrays.npz"
@@ -124,6 +126,7 @@ def archive(compression) -> bytes:
 ARCHIVES = [archive(False), archive(True)]
 
 
+@few_inputs
 @given(st.sampled_from(ARCHIVES), edits(), bit_flips(4))
 def test_npz_with_changed_bytes_is_exact_or_refused(folder, data, changes, flips):
     """Most of these files have a wrong checksum and are refused."""
@@ -132,6 +135,7 @@ def test_npz_with_changed_bytes_is_exact_or_refused(folder, data, changes, flips
     assert_exact_or_refused("npz, bytes changed", path, npz_demonstrations)
 
 
+@few_inputs
 @given(st.data())
 def test_npz_with_changed_members_is_exact_or_refused(folder, data):
     with zipfile.ZipFile(io.BytesIO(ARCHIVES[0])) as file:
@@ -150,6 +154,7 @@ LENGTHS = st.integers(-2, 9) | st.sampled_from([2**31, 2**63 - 1, 2**64, 10**30]
 SHAPES = st.sampled_from([[1, 4, 2], [2, 4, 1], [2, 4, 1]]) | st.lists(LENGTHS, max_size=4)
 
 
+@few_inputs
 @given(
     st.sampled_from(["<f8", "<i4", "|u1"]) | DTYPES,
     SHAPES,
@@ -185,6 +190,7 @@ FIRST_LINES = st.sampled_from(
 NUMBERS = st.sampled_from(["0", "1", "-2.5", "1e-3", " 7"])
 
 
+@few_inputs
 @given(
     st.sampled_from(["t,x", "t,x", "time [s],x,y"]) | FIRST_LINES,
     st.lists(st.lists(NUMBERS | NUMBERS | NUMBERS | FIELDS, min_size=1, max_size=2), max_size=4),
@@ -197,6 +203,7 @@ def test_csv_with_any_fields_is_exact_or_refused(folder, first, rows, end):
     assert_exact_or_refused("csv, odd fields", path, csv_demonstrations)
 
 
+@few_inputs
 @given(
     st.sampled_from(["t,x", "demonstration,time,x"]),
     st.integers(2, 6),
@@ -215,6 +222,7 @@ def test_csv_with_few_changed_fields_is_exact_or_refused(folder, first, length, 
 TABLE = b"demonstration,time,x [m],y\n" + b"".join(b"%d,%d,%d.5,-1e-%d\n" % (n // 5, n % 5, n, n) for n in range(10))
 
 
+@few_inputs
 @given(edits(2))
 def test_csv_with_changed_bytes_is_exact_or_refused(folder, changes):
     path = folder / "bytes.csv"
@@ -233,6 +241,7 @@ ANYTHING = st.recursive(
 ROWS = st.sampled_from([[[1], [2]], [[1.0, 2.0], [3.0, 4.0]], np.eye(2), np.array([[1], [True]], dtype=object)])
 
 
+@few_inputs
 @given(
     st.sampled_from([[0, 1], [[0, 1]], [[0, 1], (0.5, 2)], np.arange(2)]) | ANYTHING,
     st.lists(ROWS, min_size=1, max_size=2) | st.lists(ROWS | ANYTHING, max_size=2) | ANYTHING,

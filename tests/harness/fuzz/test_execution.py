@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fuzz.changes import edited, edits, entry_at, paths_in
-from fuzz.tally import attempt
+from fuzz.tally import attempt, few_inputs
 from fuzz.test_runs import ARRAYS, CONFIGS, DESCRIPTION, LAYERS, TABLE, VALUES
 from fuzz.test_templates import TEXTS as TEMPLATES
 from guiderail.models.common.errors import InputError
@@ -345,6 +345,7 @@ def test_unchanged_task_folder_is_valid(tmp_path):
     assert file.name == TASK["name"]
 
 
+@few_inputs
 @given(st.data())
 def test_code_in_a_file_is_not_executed(kind, canary, data):
     folder, files, read = kind
@@ -358,6 +359,7 @@ def test_code_in_a_file_is_not_executed(kind, canary, data):
     assert executions(canary) == []
 
 
+@few_inputs
 @given(st.data())
 def test_code_in_a_template_is_not_executed(canary, data):
     content = data.draw(with_code(data.draw(st.sampled_from(TEMPLATES)).encode(), canary))
@@ -367,6 +369,7 @@ def test_code_in_a_template_is_not_executed(canary, data):
     assert executions(canary) == []
 
 
+@few_inputs
 @given(st.data())
 def test_code_in_an_option_is_not_executed(canary, data):
     code = data.draw(st.sampled_from(code_texts(canary)))

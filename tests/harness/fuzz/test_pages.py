@@ -12,7 +12,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from fuzz.changes import changed_trees, edited, edits
-from fuzz.tally import COUNTS
+from fuzz.tally import COUNTS, few_inputs
 from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 
 TIMEOUT = 30.0  # longest time until a message has been handled [s]
@@ -94,6 +94,7 @@ def send(page, messages, **changed):
         return list(page.GetGamepad().axes)
 
 
+@few_inputs
 @given(st.lists(MESSAGES, min_size=1, max_size=MAX_MESSAGES))
 def test_page_applies_valid_messages_when_token_is_sent(page, messages):
     COUNTS["page, message with the token", "inputs"] += len(messages)
@@ -104,6 +105,7 @@ def test_page_applies_valid_messages_when_token_is_sent(page, messages):
     COUNTS["page, message with the token", "accepted"] += len(messages)
 
 
+@few_inputs
 @given(st.lists(MESSAGES, min_size=1, max_size=MAX_MESSAGES), st.data())
 def test_page_refuses_messages_when_token_is_wrong(page, messages, data):
     COUNTS["page, message without the token", "inputs"] += len(messages)

@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from spaces_only_env import SpacesOnlyEnv
 
 from fuzz.changes import bit_flips, changed_texts, changed_trees, edited, edits, flipped
-from fuzz.tally import attempt
+from fuzz.tally import attempt, few_inputs
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy, _digest
 from guiderail.tools.environments import check_environment
@@ -87,6 +87,7 @@ def assert_config_is_exact_or_refused(target, folder, text):
             assert result == float(value)
 
 
+@few_inputs
 @given(st.data())
 def test_config_with_changed_entries_is_exact_or_refused(folder, texts, data):
     tree = data.draw(changed_trees([yaml.safe_load(text) for text in texts]))
@@ -98,6 +99,7 @@ def test_config_with_changed_entries_is_exact_or_refused(folder, texts, data):
     )
 
 
+@few_inputs
 @given(st.data())
 def test_config_with_changed_characters_is_exact_or_refused(folder, texts, data):
     text = data.draw(changed_texts([text.replace("imports: []\n", "") for text in texts]))
@@ -141,6 +143,7 @@ def _summarized(folder):
     return table
 
 
+@few_inputs
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 8), FIELDS), min_size=1, max_size=3))
 def test_episodes_with_changed_fields_are_exact_or_refused(folder, changes):
     rows = [line.split(",") for line in TABLE.decode().splitlines()]
@@ -149,6 +152,7 @@ def test_episodes_with_changed_fields_are_exact_or_refused(folder, changes):
     assert_table_is_exact_or_refused("episodes.csv, odd fields", folder, "\n".join(map(",".join, rows)).encode())
 
 
+@few_inputs
 @given(edits(3))
 def test_episodes_with_changed_bytes_are_exact_or_refused(folder, changes):
     assert_table_is_exact_or_refused("episodes.csv, bytes changed", folder, edited(TABLE, changes))
@@ -158,6 +162,7 @@ ARRAYS = {"weights": np.linspace(-1, 1, 6, dtype=np.float32).reshape(2, 3), "cou
 VALUES = {"rows": ROWS[:2], "learner": {"decisions": 12, "selection": {}}, "environment": {"state": 2**100}}
 
 
+@few_inputs
 @given(edits(3), bit_flips())
 def test_checkpoint_with_changed_bytes_is_exact_or_refused(folder, changes, flips):
     save_checkpoint(folder.checkpoint, ARRAYS, VALUES)
@@ -192,6 +197,7 @@ def assert_policy_is_bounded_or_refused(target, folder, expected):
         np.testing.assert_array_equal(action, expected)
 
 
+@few_inputs
 @given(st.sampled_from(["policy.json", "policy.safetensors"]), edits(3), bit_flips())
 def test_policy_with_changed_bytes_is_exact_or_refused(folder, file, changes, flips):
     policy = Policy(LAYERS, DESCRIPTION)
@@ -201,6 +207,7 @@ def test_policy_with_changed_bytes_is_exact_or_refused(folder, file, changes, fl
     assert_policy_is_bounded_or_refused("policy, bytes changed", folder, policy(OBSERVATION))
 
 
+@few_inputs
 @given(st.data())
 def test_policy_with_changed_entries_is_bounded_or_refused(folder, data):
     """The changed policies have a valid digest."""
@@ -239,6 +246,7 @@ def restored(folder, learner, env):
     return loop
 
 
+@few_inputs
 @given(st.data())
 def test_checkpoint_with_changed_content_is_exact_or_refused(folder, resumable, data):
     """The changed checkpoints have a valid digest."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import guiderail.models.objects
 from fuzz.changes import changed_texts, changed_trees
-from fuzz.tally import attempt
+from fuzz.tally import attempt, few_inputs
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.common.yaml import parse_yaml
@@ -143,6 +143,7 @@ def assert_template_is_exact_or_refused(target, text):
         assert_laws_are_finite(template)
 
 
+@few_inputs
 @given(changed_trees(TREES))
 @example(TREES[-1])
 def test_template_with_changed_entries_is_exact_or_refused(tree):
@@ -151,6 +152,7 @@ def test_template_with_changed_entries_is_exact_or_refused(tree):
     )
 
 
+@few_inputs
 @given(changed_texts(TEXTS))
 def test_template_with_changed_characters_is_exact_or_refused(text):
     assert_template_is_exact_or_refused("template, characters changed", text)
@@ -161,6 +163,7 @@ TOKENS = st.sampled_from(
 )
 
 
+@few_inputs
 @given(st.lists(TOKENS, max_size=12).map("".join))
 def test_arithmetic_is_exact_or_refused(expression):
     tree = copy.deepcopy(TREES[-1])
@@ -177,6 +180,7 @@ VALUES = st.recursive(
 )
 
 
+@few_inputs
 @given(VALUES)
 def test_yaml_round_trip_is_exact(value):
     text = yaml.safe_dump(value)

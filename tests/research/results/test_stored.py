@@ -1,12 +1,14 @@
 """Statements of docs/results.md against the stored tables."""
 
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.tables import read_table
+from guiderail.tools.tables import read_table as read_uncached
 
+read_table = cache(read_uncached)  # each test reads several methods of a table
 RESULTS = Path(__file__).parents[3] / "research" / "results"
 MIN_JERK_RATIO = 3.0  # smallest ratio of jerks that the page calls "several times"
 VIOLATIONS = ["max_commanded_violation", "training_max_commanded_violation"]
