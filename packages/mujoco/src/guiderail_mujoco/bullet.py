@@ -94,7 +94,7 @@ class BulletEngine:
         weakref.finalize(self, bullet.disconnect, **self._client)
         bullet.setPhysicsEngineParameter(
             numSolverIterations=ITERATIONS, solverResidualThreshold=0.0, enableConeFriction=1, enableFileCaching=0,
-            contactBreakingThreshold=CONTACT_DISTANCE, deterministicOverlappingPairs=1, **self._client,
+            deterministicOverlappingPairs=1, **self._client,
         )  # fmt: skip
         self._mass = CARRIAGE_MASS + inertia.get_mass()
         self._inertia = CARRIAGE_INERTIA + float(inertia.CalcRotationalInertia().get_moments().mean())
@@ -203,7 +203,8 @@ class BulletEngine:
         bullet, client = self._bullet, self._client
         num_substeps = max(math.ceil(math.sqrt(given.modulus) - 1e-9), 1)
         step = self.time_step / num_substeps
-        bullet.setTimeStep(step, **client)
+        # The distance is a global variable of Bullet, which other simulations in this process may change.
+        bullet.setPhysicsEngineParameter(fixedTimeStep=step, contactBreakingThreshold=CONTACT_DISTANCE, **client)
         for link, _, friction in self._refreshed:
             bullet.changeDynamics(self._fixture, link, lateralFriction=friction * given.friction, **client)
         self._write(state, given)

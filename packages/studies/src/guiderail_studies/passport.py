@@ -56,7 +56,8 @@ def passport_conditions(
     steps: list[Condition] = []
     changes: list[Condition] = []
     for name in names:
-        default = 1e3 * plant_step(task, environment) if name == "drake" else ENGINE_STEP
+        own_step = 1e3 * (environment.get("engine_step") or 0.0) or ENGINE_STEP
+        default = 1e3 * plant_step(task, environment) if name == "drake" else own_step
         own = [in_engine(name, environment, default / division) for division in DIVISIONS[name]]
         for condition in own:
             check_environment(task, condition.environment)
