@@ -1,5 +1,6 @@
 from .cartesian_impedance_controller import CartesianImpedanceController as CartesianImpedanceController
 from .cartesian_impedance_controller import ImpedanceGains as ImpedanceGains
+from .cartesian_impedance_controller import Payload as Payload
 from .cartesian_position_controller import CartesianPositionController as CartesianPositionController
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .command_checks import CommandFilter as CommandFilter
@@ -11,6 +12,7 @@ from .episode_terms import EpisodeMonitor as EpisodeMonitor
 from .episode_terms import RewardSystem as RewardSystem
 from .episode_terms import RewardTerm as RewardTerm
 from .episode_terms import TerminationTerm as TerminationTerm
+from .gripper_command import GripperCommand as GripperCommand
 from .law_system import LawSystem as LawSystem
 from .movement_primitive import HistoryBuffer as HistoryBuffer
 from .movement_primitive import HistoryLengthSchedule as HistoryLengthSchedule
@@ -22,7 +24,11 @@ from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
 from .poses import ContinuousPose as ContinuousPose
 from .poses import MeasuredPose as MeasuredPose
+from .poses import PoseFromTransform as PoseFromTransform
 from .poses import RelativePoses as RelativePoses
+from .poses import SpatialForceFromWrench as SpatialForceFromWrench
+from .poses import TransformFromPose as TransformFromPose
+from .poses import WrenchFromSpatialForce as WrenchFromSpatialForce
 from .recorder import Recorder as Recorder
 from .recorder import Recording as Recording
 from .shared_control_template import ActiveConstraintProjector as ActiveConstraintProjector

@@ -1,13 +1,17 @@
 """Cartesian impedance control of a torque-controlled arm."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.math import RigidTransform_, RollPitchYaw_
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, BasicVector_, Context
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
@@ -21,6 +25,7 @@ from guiderail.systems.support.drake_multibody import (
     transform_to_pose,
 )
 from guiderail.systems.support.last_valid import CommandValidity, LastValidBound, LastValidPose
+from guiderail.systems.support.scalar_conversion import ConvertibleSystem, differentiable_torques, values_of
 
 MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; above it, wrenches could overflow
 
@@ -76,7 +81,28 @@ class ImpedanceGains:
             object.__setattr__(self, name, array)
 
 
-class CartesianImpedanceController(LeafSystem):
+@dataclass(frozen=True)
+class Payload:
+    """Point mass at the tool that a controller compensates, in addition to its plant.
+
+    Args:
+        mass: Mass [kg], not negative, finite.
+        center: Center of mass in the frame of the tool center, (3,) [m].
+
+    Raises:
+        InputError: If an argument is out of range or of another shape.
+    """
+
+    mass: float = 0.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        center = as_numbers(self.center, "the center of a payload")
+        if not 0.0 <= self.mass < np.inf or center.shape != (3,) or not np.isfinite(center).all():
+            raise InputError(f"a payload has a finite mass of at least 0 and a center of three numbers, not {self}")
+
+
+class CartesianImpedanceController(ConvertibleSystem):
     """Impedance controller: the tool center P of an arm acts as a spring and damper around a desired pose.
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
@@ -86,8 +112,11 @@ class CartesianImpedanceController(LeafSystem):
     quaternions, so no orientation is singular. The damping D is computed from K and the arm's inertia in its present
     posture. While no valid command is available, the last valid command is followed (`LastValidPose`).
 
-    The gains are numeric parameters of the context: `set_gains` changes them between two steps of a simulation, and a
-    context that is copied or restored has them.
+    Gains and payload are numeric parameters of the context: `set_gains` and `set_payload` change them between two steps
+    of a simulation, and a context that is copied or restored has them.
+
+    `ToAutoDiffXd` converts a controller without bound, for derivatives with respect to state, desired pose, gains and
+    payload. The converted controller follows the present command, whether it is valid or not.
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
@@ -113,7 +142,8 @@ class CartesianImpedanceController(LeafSystem):
 
     Raises:
         InputError: If a frame belongs to another plant, T is not fixed in the world, or a joint does not have exactly
-            one actuator. At an evaluation, if the estimated state is not finite.
+            one actuator. At an evaluation, if the estimated state is not finite. At a conversion, if the impedance is
+            bounded or the scalar type is not AutoDiffXd.
     """
 
     def __init__(
@@ -131,8 +161,9 @@ class CartesianImpedanceController(LeafSystem):
         check_plant(plant, target, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
-        self._parameters = [self.DeclareNumericParameter(BasicVector(numbers)) for numbers in _to_numbers(gains)]
-        self._present_gains = declare.cache(self, "gains", self._calc_gains, [self.all_parameters_ticket()])
+        self._default_parameters = [*_to_numbers(gains), np.zeros(4)]
+        self._parameters = [self.DeclareNumericParameter(BasicVector(numbers)) for numbers in self._default_parameters]
+        self._tuning = declare.cache(self, "gains_and_payload", self._calc_tuning, [self.all_parameters_ticket()])
         self._compensate_gravity = compensate_gravity
         self._torque_limits = effort_limits(plant)
 
@@ -149,7 +180,7 @@ class CartesianImpedanceController(LeafSystem):
         bound = gains.bound or WrenchBound(gains.wrench_limits, np.inf, np.inf)
         self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
         sources = [*self._followed_pose.sources, self._estimated_state_port, *self._requested_bound.sources]
-        self._law = declare.cache(self, "law", self._calc_law, [*sources, self._present_gains])
+        self._law = declare.cache(self, "law", self._calc_law, [*sources, self._tuning])
         declare.part_output(self, "generalized_force", self._law, lambda law: law.torque, num_joints)
         declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
         declare.part_output(self, "impedance_wrench", self._law, lambda law: law.wrench, 6)
@@ -168,7 +199,7 @@ class CartesianImpedanceController(LeafSystem):
 
     def gains(self, context: Context) -> ImpedanceGains:
         """Return the gains; `context` is the context of the system."""
-        gains: ImpedanceGains = self._present_gains.Eval(context)
+        gains, _ = self._tuning.Eval(context)
         return gains
 
     def set_gains(self, context: Context, gains: ImpedanceGains) -> None:
@@ -181,16 +212,28 @@ class CartesianImpedanceController(LeafSystem):
         declare.check_own_context(self, context)
         if gains.bound is not self._gains.bound:
             raise InputError("the bound of an impedance is constant: keep it, and lower it at the port max_wrench")
-        for index, numbers in zip(self._parameters, _to_numbers(gains), strict=True):
+        for index, numbers in zip(self._parameters, _to_numbers(gains), strict=False):
             context.get_mutable_numeric_parameter(index).SetFromVector(numbers)
 
-    def _calc_gains(self, context: Context) -> ImpedanceGains:
-        """Return the gains of the context; those of the constructor are not converted back."""
+    def set_payload(self, context: Context, payload: Payload) -> None:
+        """Set the payload that is compensated, in the context of the system.
+
+        Raises:
+            InputError: If the context is another system's.
+        """
+        declare.check_own_context(self, context)
+        numbers = np.array([payload.mass, *payload.center])
+        context.get_mutable_numeric_parameter(self._parameters[-1]).SetFromVector(numbers)
+
+    def _calc_tuning(self, context: Context) -> tuple[ImpedanceGains, Payload]:
+        """Return gains and payload of the context; the gains of the constructor are not converted back."""
         numbers = [np.array(context.get_numeric_parameter(index).CopyToVector()) for index in self._parameters]
-        if all(map(np.array_equal, numbers, _to_numbers(self._gains))):
-            return self._gains
-        stiffness, limits, posture, (ratio, posture_stiffness, posture_damping) = numbers
-        return replace(
+        *gains, payload = numbers
+        mass, x, y, z = payload.tolist()
+        if all(map(np.array_equal, gains, _to_numbers(self._gains))):
+            return self._gains, Payload(mass, (x, y, z))
+        stiffness, limits, posture, (ratio, posture_stiffness, posture_damping) = gains
+        changed = replace(
             self._gains,
             stiffness=stiffness.reshape(6, 6),
             wrench_limits=limits,
@@ -199,24 +242,44 @@ class CartesianImpedanceController(LeafSystem):
             posture_stiffness=float(posture_stiffness),
             posture_damping=float(posture_damping),
         )
+        return changed, Payload(mass, (x, y, z))
 
     def _pose(self, context: Context) -> np.ndarray:
         return transform_to_pose(self._tool_center.CalcPose(self._plant_context.Eval(context), self._target))
 
     def _calc_law(self, context: Context) -> JointTorques:
-        gains, plant, plant_context = self.gains(context), self._plant, self._plant_context.Eval(context)
+        gains, payload = self._tuning.Eval(context)
+        plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
-        X_TP = self._tool_center.CalcPose(plant_context, self._target)
+        law = self._law_arguments(self._plant, plant_context, X_TPd, gains, payload.mass, np.array(payload.center))
+        return impedance_torques(law, self._bound(context))
+
+    def _law_arguments(
+        self, plant: Any, plant_context: Any, X_TPd: Any, gains: Any, mass: Any, center: np.ndarray
+    ) -> ArmImpedance:
+        """Return the arguments of the law, for a plant of any scalar type; `mass` and `center` are of the payload."""
+        frames = (self._tool_center, self._target)
+        tool_center, target = (plant.get_frame(frame.index()) for frame in frames)
+        X_TP = tool_center.CalcPose(plant_context, target)
         eta, epsilon = orientation_error(X_TPd.rotation(), X_TP.rotation())
         J = plant.CalcJacobianSpatialVelocity(
-            plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
+            plant_context, JacobianWrtVariable.kV, tool_center, np.zeros(3), target, target
         )
         M = plant.CalcMassMatrix(plant_context)
         q, v = plant.GetPositions(plant_context), plant.GetVelocities(plant_context)
         gravity_torque = np.zeros_like(v)
         if self._compensate_gravity:
             gravity_torque = -plant.CalcGravityGeneralizedForces(plant_context)
-        law = ArmImpedance(
+        if mass > 0.0:
+            world = plant.world_frame()
+            J_center = plant.CalcJacobianTranslationalVelocity(
+                plant_context, JacobianWrtVariable.kV, tool_center, center, world, world
+            )
+            M = M + mass * J_center.T @ J_center
+            if self._compensate_gravity:
+                weight = mass * plant.gravity_field().gravity_vector()
+                gravity_torque = gravity_torque - J_center.T @ weight
+        return ArmImpedance(
             K=gains.stiffness,
             damping_ratio=gains.damping_ratio,
             wrench_limits=gains.wrench_limits,
@@ -230,7 +293,58 @@ class CartesianImpedanceController(LeafSystem):
             gravity_torque=gravity_torque,
             torque_limits=self._torque_limits,
         )
-        return impedance_torques(law, self._bound(context))
+
+    def declare_converted(self, system: Any, scalar: type) -> None:
+        """Declare the ports, states and parameters of this system in `system`, a system of `AutoDiffXd`.
+
+        Raises:
+            InputError: If the impedance is bounded, or `scalar` is another type.
+        """
+        if scalar is not AutoDiffXd:
+            raise InputError("an impedance has no symbolic form: convert it to AutoDiffXd, or evaluate it with floats")
+        if self._gains.bound is not None:
+            raise InputError("the law of a bounded impedance is not smooth: convert a controller without bound")
+        default = self.CreateDefaultContext().get_discrete_state()
+        for number in range(default.num_groups()):
+            system.DeclareDiscreteState(default.value(number))
+        parameters = [system.DeclareNumericParameter(BasicVector_[scalar](n)) for n in self._default_parameters]
+        ports = [self.get_input_port(index) for index in range(self.num_input_ports())]
+        inputs = {port.get_name(): system.DeclareVectorInputPort(port.get_name(), port.size()) for port in ports}
+        state, desired_pose = inputs["estimated_state"], inputs["desired_pose"]
+        plant = self._plant.ToAutoDiffXd()
+
+        def calc_law(context: Any) -> tuple[JointTorques, np.ndarray]:
+            if inputs["max_wrench"].HasValue(context):
+                raise InputError("the law of a bounded impedance is not smooth: do not connect max_wrench")
+            numbers = [context.get_numeric_parameter(index).CopyToVector() for index in parameters]
+            stiffness, limits, posture, (ratio, posture_stiffness, posture_damping), payload = numbers
+            gains = SimpleNamespace(
+                stiffness=stiffness.reshape(6, 6),
+                wrench_limits=limits,
+                posture=posture,
+                damping_ratio=ratio,
+                posture_stiffness=posture_stiffness,
+                posture_damping=posture_damping,
+            )
+            plant_context, pose, present = plant.CreateDefaultContext(), desired_pose.Eval(context), state.Eval(context)
+            for name, values in (("state", present), ("desired pose", pose)):
+                if not is_finite(values_of(values)):  # Drake would abort the process
+                    raise InputError(f"derivatives of an impedance need a finite {name}, not {values_of(values)}")
+            plant.SetPositionsAndVelocities(plant_context, present)
+            X_TPd = RigidTransform_[scalar](RollPitchYaw_[scalar](pose[5], pose[4], pose[3]), pose[:3])
+            tool_center, target = (plant.get_frame(frame.index()) for frame in (self._tool_center, self._target))
+            X_TP = tool_center.CalcPose(plant_context, target)
+            measured = [*X_TP.translation(), *RollPitchYaw_[scalar](X_TP.rotation()).vector()[::-1]]
+            law = self._law_arguments(plant, plant_context, X_TPd, gains, payload[0], payload[1:])
+            return differentiable_torques(law), np.array(measured)
+
+        sources = [state, desired_pose, inputs["max_wrench"], system.all_parameters_ticket()]
+        law = declare.cache(system, "law", calc_law, sources)
+        declare.part_output(system, "generalized_force", law, lambda value: value[0].torque, len(self._torque_limits))
+        declare.part_output(system, "pose", law, lambda value: value[1], 6)
+        declare.part_output(system, "impedance_wrench", law, lambda value: value[0].wrench, 6)
+        declare.part_output(system, "saturation", law, lambda value: scalar(float(value[0].is_saturated)))
+        declare.scalar_output(system, "command_timed_out", lambda context: scalar(0.0), [system.nothing_ticket()])
 
     def _bound(self, context: Context) -> WrenchBound | None:
         return self._requested_bound.eval(context) if self._max_wrench_port.HasValue(context) else self._gains.bound

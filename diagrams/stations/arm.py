@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.multibody.tree import FixedOffsetFrame, Frame, JointActuator, ModelInstanceIndex, RigidBody, WeldJoint
+from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control
@@ -17,6 +17,7 @@ from guiderail.diagrams.stations.options import ArmOptions, JointTorqueAccuracy
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
+    PLANT_PERIOD,
     WRENCH_TIME_CONSTANT,
     ControllerPlant,
     Impedance,
@@ -31,8 +32,10 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
-from guiderail.models.robots.mounting import add_end_effector, add_robot, lighten_rotors
+from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import EndEffector, Robot, find_end_effector, find_robot
+from guiderail.systems.gripper_command import GripperCommand
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.wrench_sensors import ExternalTorqueSensor, JointTorqueErrors, JointTorqueWrench, WrenchSensor
 
 WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # filter time constant of a wrench estimated from joint torques [s]
@@ -49,6 +52,8 @@ class ArmModel:
     tool_center: Frame  # frame of the tool center P
     wrist: WeldJoint  # joint between flange and tool
     tool: list[RigidBody]  # bodies of tool and workpiece, the first at the wrist
+    tool_model: ModelInstanceIndex  # model instance of the tool's joints
+    gripper: list[JointActuator]  # actuators of the tool's joints
 
 
 def add_arm(
@@ -56,18 +61,24 @@ def add_arm(
     workcell: Workcell,
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+    *,
+    as_rigid: bool = False,
 ) -> ArmModel:
     """Add arm, tool and workpiece to a plant that is not finalized; the arm's base is at the world's origin.
 
-    `robot` and `end_effector` are objects or names.
+    `robot` and `end_effector` are objects or names. With `as_rigid`, a gripper is one rigid body in its open state.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
     lighten_rotors(robot, arm)
-    tool = add_end_effector(plant, robot, arm, end_effector)
+    tool = add_end_effector(plant, robot, arm, end_effector, as_rigid=as_rigid)
+    if tool.actuators and end_effector.drives is not None:
+        add_drives(tool.actuators, end_effector.drives)
     workpiece = workcell.add_workpiece(plant, tool.tool_center)
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
-    return ArmModel(arm.model, target, tool.tool_center, tool.wrist, [*tool.bodies, workpiece])
+    return ArmModel(
+        arm.model, target, tool.tool_center, tool.wrist, [*tool.bodies, workpiece], tool.model, tool.actuators
+    )
 
 
 def controller_model(
@@ -75,20 +86,20 @@ def controller_model(
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
 ) -> tuple[MultibodyPlant, ArmModel]:
-    """Return the controller's plant and its arm; the plant has no fixture and no offsets.
+    """Return the controller's plant and its arm; the plant has no fixture, no offsets and no joints of the tool.
 
     Raises:
         InputError: If the joints of the robot's model are not `Robot.joints`, in this order.
     """
     robot = find_robot(robot)
     plant = MultibodyPlant(0.0)
-    arm = add_arm(plant, workcell, robot, end_effector)
+    arm = add_arm(plant, workcell, robot, end_effector, as_rigid=True)
     plant.Finalize()
     starts = [plant.GetJointByName(name, arm.model).position_start() for name in robot.joints]
     if starts != list(range(plant.num_positions())):
         raise InputError(
             f"the joints of robot {robot.name!r}'s model must be those of `Robot.joints`, in order from the base to "
-            "the flange: fix all other joints in its model file"
+            "the flange: model other moving parts as an end effector"
         )
     return plant, arm
 
@@ -111,12 +122,47 @@ class ArmControllerPlant(ControllerPlant):
         self.posture = self.solve(MID_TURN_POSE, self.posture)
 
 
+def add_gripper_control(
+    builder: DiagramBuilder, plant: MultibodyPlant, arm: ArmModel, end_effector: EndEffector, period: float
+) -> tuple[InputPort, OutputPort]:
+    """Add the drives of a gripper with n actuated joints, sampled with `period` [s].
+
+    Returns:
+        Input port of the desired positions (n,), and output port of positions and velocities (2n,).
+    """
+    joints = [actuator.joint() for actuator in arm.gripper]
+    lower = np.concatenate([joint.position_lower_limits() for joint in joints])
+    upper = np.concatenate([joint.position_upper_limits() for joint in joints])
+    opening = np.array([end_effector.opening[joint.name()] for joint in joints])
+    command = builder.AddNamedSystem("gripper_command", GripperCommand(lower, upper, opening, period=period))
+    # The model's state includes joints that mimic other joints.
+    num_positions = plant.num_positions(arm.tool_model)
+    all_joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
+    first = min(joint.position_start() for joint in all_joints if joint.num_positions() > 0)
+    actuated = np.zeros((2 * len(joints), plant.num_multibody_states(arm.tool_model)))
+    for row, joint in enumerate(joints):
+        column = joint.position_start() - first
+        actuated[row, column] = actuated[len(joints) + row, num_positions + column] = 1.0
+    state = add_system(builder, "gripper_state", MatrixGain(actuated), plant.get_state_output_port(arm.tool_model))
+    builder.Connect(command.get_desired_state_output_port(), plant.get_desired_state_input_port(arm.tool_model))
+    return command.get_position_input_port(), state.get_output_port()
+
+
 @register_station("arm", workcell_kind="insertion", options=ArmOptions)
 class ArmStation(Station):
     """Arm under a Cartesian impedance controller, and a workcell.
 
     The rotors' reflected inertia makes the arm slower than the gantry. Control of the arm is therefore stable although
-    the controller is evaluated once per plant step.
+    the controller is evaluated once per plant step. With a gripper as the end effector, the station has two more ports:
+
+    ==================  =========  ====================================================================================
+    port                size       meaning
+    ==================  =========  ====================================================================================
+    `gripper_position`  n          input, optional: desired positions of the gripper's actuated joints; open by default
+    `gripper_state`     2n         output: positions and velocities of these joints
+    ==================  =========  ====================================================================================
+
+    A gripper's force is limited by its actuators. Controller and wrench sensor model it as a rigid, open tool.
 
     If `joint_torque` is given, `wrench` is estimated from joint torques with errors, as in a `HardwareStation`, and the
     port `exact_wrench` is the exact wrench at the wrist.
@@ -143,7 +189,8 @@ class ArmStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of plant and controller [s]; that of the workcell, or `PLANT_PERIOD` by default.
+            time_step: Time step of plant and controller [s]; that of the workcell, or `PLANT_PERIOD` by default, at
+                most half of it with a gripper, whose fingers would otherwise penetrate the workpiece.
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.
             joint_torque: Errors of the joint torques from which the wrench is estimated; None for a sensor at the
@@ -156,8 +203,9 @@ class ArmStation(Station):
         super().__init__()
         self.estimates_wrench, self._joint_torque = joint_torque is not None, joint_torque
         builder = DiagramBuilder()
+        end_effector = find_end_effector(end_effector)
         if time_step is None:
-            time_step = plant_period(workcell)
+            time_step = plant_period(workcell, PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD)
         control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
         self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)
@@ -184,8 +232,19 @@ class ArmStation(Station):
             contact_wrench=contact_wrench,
         )
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))
+        if arm.gripper:
+            position, state = add_gripper_control(builder, plant, arm, end_effector, time_step)
+            builder.ExportInput(position, "gripper_position")
+            builder.ExportOutput(state, "gripper_state")
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
+
+    get_gripper_position_input_port = input_getter(
+        "gripper_position", "desired positions of the gripper's actuated joints, (n,), if there is a gripper"
+    )
+    get_gripper_state_output_port = output_getter(
+        "gripper_state", "state of the gripper's actuated joints, (2n,), if there is a gripper"
+    )
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""

@@ -1,4 +1,4 @@
-"""Stations around an inner station, such as one with continuous angles."""
+"""Stations around an inner station: with continuous angles, or with ports of rigid transforms and spatial forces."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,8 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.systems.poses import ContinuousPose
+from guiderail.systems.poses import ContinuousPose, PoseFromTransform, SpatialForceFromWrench, TransformFromPose
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class WrappedStation(Station):
@@ -75,3 +76,40 @@ class ContinuousStation(WrappedStation):
             is_pose = port.get_name() == "pose"
             builder.ExportOutput(measured.get_continuous_pose_output_port() if is_pose else port, port.get_name())
         builder.BuildInto(self)
+
+
+class TransformStation(WrappedStation):
+    """A station with abstract ports, for diagrams whose signals are Drake's transforms and forces.
+
+    It has the ports of the inner station, except that ``desired_transform``, an abstract `RigidTransform` X_TP,
+    replaces ``desired_pose``. Additional outputs are ``transform``, the measured X_TP, and ``spatial_force``, the
+    `SpatialForce` of the surroundings on the tool at P in the axes of T.
+    """
+
+    def __init__(self, station: Station):
+        """Construct the station; the given `station` becomes its subsystem.
+
+        Raises:
+            InputError: If the poses of the station are not those of a body in space.
+        """
+        super().__init__(station)
+        self.wraps_angles = station.wraps_angles
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("station", station)
+        for port in map(station.get_input_port, range(station.num_input_ports())):
+            if port.get_name() != "desired_pose":
+                builder.ExportInput(port, port.get_name())
+        for port in map(station.get_output_port, range(station.num_output_ports())):
+            builder.ExportOutput(port, port.get_name())
+        desired = builder.AddNamedSystem("desired_pose", PoseFromTransform())
+        builder.Connect(desired.get_pose_output_port(), station.get_desired_pose_input_port())
+        builder.ExportInput(desired.get_transform_input_port(), "desired_transform")
+        pose = add_system(builder, "transform", TransformFromPose(), pose=station.get_pose_output_port())
+        builder.ExportOutput(pose.get_transform_output_port(), "transform")
+        force = add_system(builder, "spatial_force", SpatialForceFromWrench(), wrench=station.get_wrench_output_port())
+        builder.ExportOutput(force.get_spatial_force_output_port(), "spatial_force")
+        builder.BuildInto(self)
+
+    get_desired_transform_input_port = input_getter("desired_transform", "desired transform X_TP")
+    get_transform_output_port = output_getter("transform", "measured transform X_TP")
+    get_spatial_force_output_port = output_getter("spatial_force", "spatial force of the surroundings on the tool")

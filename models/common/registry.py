@@ -63,6 +63,7 @@ BUILT_IN = {
     "robot:panda": f"{_ROBOTS}.catalog:PANDA",
     "robot:ur5e": f"{_ROBOTS}.catalog:UR5E",
     "end_effector:connector_tool": f"{_ROBOTS}.catalog:CONNECTOR_TOOL",
+    "end_effector:parallel_gripper": f"{_ROBOTS}.catalog:PARALLEL_GRIPPER",
     "kernel:matern52": "guiderail.models.primitives.kernels:Matern52",
     "kernel:squared_exponential": "guiderail.models.primitives.kernels:SquaredExponential",
     "learner:crossq": f"{_LEARNING}.off_policy:CrossQLearner",

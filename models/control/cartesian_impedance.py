@@ -1,10 +1,11 @@
 """Cartesian impedance law: a spring to the desired pose, and a damper designed from the spring and the inertia.
 
 Vectors of six are [translational, rotational], and all quantities are expressed in one frame.
+`systems/support/scalar_conversion.py` has the same law for AutoDiffXd.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -23,13 +24,13 @@ _SCALE = np.repeat([1.0, LEVER], 3)
 
 
 class ArmImpedance(NamedTuple):
-    """Arm and impedance at an instant, the arguments of the law."""
+    """Arm and impedance at an instant, the arguments of the law: floats or, for derivatives, `AutoDiffXd`."""
 
     K: np.ndarray  # stiffness (6, 6) [N/m, Nm/rad]
-    damping_ratio: float  # damping ratio ζ of every mode
+    damping_ratio: Any  # damping ratio ζ of every mode
     wrench_limits: np.ndarray  # limits (6,) along the axes [N, Nm]
     p_error: np.ndarray  # position error (3,) [m], as in `spring_wrench`
-    eta: float  # scalar part of the orientation error, as in `spring_wrench`
+    eta: Any  # scalar part of the orientation error, as in `spring_wrench`
     epsilon: np.ndarray  # vector part (3,) of the orientation error, as in `spring_wrench`
     J: np.ndarray  # geometric Jacobian of the tool center (6, n)
     M: np.ndarray  # mass matrix (n, n), including the reflected rotor inertia
@@ -129,7 +130,7 @@ def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> Jo
     _, M_inverse_JT, failed = lapack.dposv(law.M, J.T, lower=1)
     if failed:
         raise np.linalg.LinAlgError("the arm's mass matrix is not positive definite")
-    Lambda_inverse = J @ M_inverse_JT + _REGULARIZATION
+    Lambda_inverse = regularized(J @ M_inverse_JT)
     R_inverse = _root_of_inverse(Lambda_inverse)
     L_modes, eigenvalues = _modes(K, R_inverse)
     velocity = J @ law.v
@@ -151,6 +152,16 @@ def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> Jo
     unlimited_torque = J.T @ (wrench - leak) + law.posture_torque + law.gravity_torque
     torque = _clipped(unlimited_torque, law.torque_limits)
     return JointTorques(torque, wrench, is_limited or bool((torque != unlimited_torque).any()))
+
+
+def regularized(Lambda_inverse: np.ndarray) -> np.ndarray:
+    """Return an inverse inertia (6, 6) that is positive definite also for a singular arm."""
+    return Lambda_inverse + _REGULARIZATION
+
+
+def has_regular_inertia(Lambda_inverse: np.ndarray) -> bool:
+    """Return True if the inertia Λ (6, 6) at the tool is that of a regular arm, in which no direction is lost."""
+    return _is_regular(_root_of_inverse(Lambda_inverse))
 
 
 def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Arms and end effectors of this package: KUKA LBR iiwa 14 R820, Franka Emika Panda, UR5e, connector tool."""
+"""Arms and end effectors of this package: KUKA LBR iiwa 14 R820, Franka Emika Panda, UR5e, connector tool, gripper."""
 
 import math
 from pathlib import Path
@@ -96,6 +96,22 @@ CONNECTOR_TOOL = register_end_effector(
         tool_center="tool_center",
         bodies=("tool_body", "tool_center"),
         X_FlangeMount=RigidTransform(RotationMatrix.MakeZRotation(-MOUNT_ANGLE), [0.0, 0.0, 0.0]),
+        source="this project's own design",
+    )
+)
+
+PARALLEL_GRIPPER = register_end_effector(
+    EndEffector(
+        name="parallel_gripper",
+        title="gripper with two parallel fingers",
+        model=Path(__file__).parent / "parallel_gripper.urdf",
+        mount_frame="gripper_body",
+        tool_center="tool_center",
+        bodies=("gripper_body", "left_finger", "right_finger", "tool_center"),
+        joints=("left_finger_joint",),
+        opening={"left_finger_joint": 0.04, "right_finger_joint": 0.04},
+        # One drive moves both fingers.
+        drives=JointDrives(stiffness=(5000.0,), inertia=(0.12,)),
         source="this project's own design",
     )
 )

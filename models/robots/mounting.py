@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import (
+    FixedOffsetFrame,
     Frame,
     Joint,
     JointActuator,
@@ -41,6 +42,9 @@ class MountedEndEffector:
     wrist: WeldJoint  # joint to the flange, at which a wrist sensor measures
     tool_center: Frame  # frame P of the tool center
     bodies: list[RigidBody]  # all bodies; the first is the child of `wrist`
+    model: ModelInstanceIndex  # model instance
+    # Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
+    actuators: list[JointActuator]
 
 
 def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
@@ -65,7 +69,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
 
 
 def add_end_effector(
-    plant: MultibodyPlant, robot: Robot, mounted: MountedRobot, end_effector: EndEffector
+    plant: MultibodyPlant, robot: Robot, mounted: MountedRobot, end_effector: EndEffector, *, as_rigid: bool = False
 ) -> MountedEndEffector:
     """Mount an end effector to a robot's flange.
 
@@ -74,24 +78,17 @@ def add_end_effector(
         robot: Robot, whose `tool_turn` defines the orientation of the mount.
         mounted: Robot in the plant.
         end_effector: End effector to mount.
-
-    Raises:
-        InputError: If the model file is missing, cannot be read, does not match the end effector's data, or has a
-            joint that moves.
+        as_rigid: If True, add the opened gripper as one rigid body, for a controller's plant; no effect on a rigid
+            tool.
     """
-    label = f"end effector {end_effector.name!r}"
-    models = _read(plant, end_effector.model, label)
-    if len(models) != 1:
-        raise InputError(f"{label}: {end_effector.model} must contain one model, not {len(models)}")
-    find = partial(_find, plant, models, label, end_effector.model)
-    mount, tool_center = (find("frame", name) for name in (end_effector.mount_frame, end_effector.tool_center))
-    bodies = [find("body", name) for name in end_effector.bodies]
-    for joint in map(plant.get_joint, plant.GetJointIndices(models[0])):
-        if joint.num_velocities():
-            raise InputError(f"{label}: joint {joint.name()!r} moves, and a tool is rigid: fix it in the model file")
     X_FlangeMount = RigidTransform(RotationMatrix.MakeZRotation(robot.tool_turn), [0.0, 0.0, 0.0])
-    wrist = plant.WeldFrames(mounted.flange, mount, X_FlangeMount @ end_effector.X_FlangeMount)
-    return MountedEndEffector(wrist, tool_center, bodies)
+    X_FlangeMount = X_FlangeMount @ end_effector.X_FlangeMount
+    if as_rigid and end_effector.is_gripper:
+        return _add_rigid_copy(plant, mounted, end_effector, X_FlangeMount)
+    mount, tool_center, bodies, joints = _add_opened(plant, end_effector)
+    wrist = plant.WeldFrames(mounted.flange, mount, X_FlangeMount)
+    actuators = _list_actuators(plant, joints, f"end effector {end_effector.name!r}")
+    return MountedEndEffector(wrist, tool_center, bodies, mount.model_instance(), actuators)
 
 
 def lighten_rotors(robot: Robot, mounted: MountedRobot) -> None:
@@ -126,8 +123,25 @@ def _find(
     raise InputError(f"{label}: {file.name} has no {kind} {name!r}")
 
 
+def _add_opened(plant: MultibodyPlant, end_effector: EndEffector) -> tuple[Frame, Frame, list[RigidBody], list[Joint]]:
+    """Add the model of an opened end effector; return mount, tool center, bodies and actuated joints."""
+    label = f"end effector {end_effector.name!r}"
+    models = _read(plant, end_effector.model, label)
+    if len(models) != 1:
+        raise InputError(f"{label}: {end_effector.model} must contain one model, not {len(models)}")
+    find = partial(_find, plant, models, label, end_effector.model)
+    mount, tool_center = (find("frame", name) for name in (end_effector.mount_frame, end_effector.tool_center))
+    bodies = [find("body", name) for name in end_effector.bodies]
+    joints = [find("joint", name) for name in end_effector.joints]
+    for name, position in end_effector.opening.items():
+        find("joint", name).set_default_positions([position])
+    return mount, tool_center, bodies, joints
+
+
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
     """Return the actuators of the joints; these must be all actuated joints of their model, in the model's order."""
+    if not joints:
+        return []
     actuators = [
         actuator
         for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -178,3 +192,23 @@ def _check_joints(
                     f"{label}: {what} of joint {joint.name()!r} must be from {lower:g} to {upper:g}, "
                     f"its limits in the model file, not {posture[index]:g}"
                 )
+
+
+def _add_rigid_copy(
+    plant: MultibodyPlant, mounted: MountedRobot, end_effector: EndEffector, X_FlangeMount: RigidTransform
+) -> MountedEndEffector:
+    """Add one body with the inertia of the open gripper."""
+    gripper_plant = MultibodyPlant(time_step=1e-3)  # only discrete plants support mimic joints
+    gripper_plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+    mount, gripper_center, bodies, _ = _add_opened(gripper_plant, end_effector)
+    gripper_plant.WeldFrames(gripper_plant.world_frame(), mount)
+    gripper_plant.Finalize()
+    context = gripper_plant.CreateDefaultContext()
+    M = gripper_plant.CalcSpatialInertia(context, mount, [body.index() for body in bodies])
+    X_MountP = gripper_center.CalcPose(context, mount)
+
+    instance = plant.AddModelInstance(end_effector.name)
+    body = plant.AddRigidBody(end_effector.bodies[0], instance, M)
+    wrist = plant.WeldFrames(mounted.flange, body.body_frame(), X_FlangeMount)
+    tool_center = plant.AddFrame(FixedOffsetFrame(end_effector.tool_center, body.body_frame(), X_MountP, instance))
+    return MountedEndEffector(wrist, tool_center, [body], instance, [])

@@ -6,6 +6,7 @@ The robots of this package are in `catalog.py`, each with a model file and a row
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,7 +87,11 @@ class Robot:
 
 @dataclass(frozen=True)
 class EndEffector:
-    """End effector: a rigid tool."""
+    """End effector: a rigid tool or a gripper.
+
+    Raises:
+        InputError: If `opening` lacks a finite position of an actuated joint.
+    """
 
     name: str  # name in the registry
     title: str  # name for users
@@ -98,7 +103,20 @@ class EndEffector:
     bodies: tuple[str, ...]  # names of all bodies, the mount first
     # Pose of the mount in the flange frame, after a rotation of that frame by the robot's `tool_turn`.
     X_FlangeMount: RigidTransform = field(default_factory=RigidTransform)
+    joints: tuple[str, ...] = ()  # names of the actuated joints of a gripper, without mimic joints; empty for a tool
+    # Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
+    opening: Mapping[str, float] = field(default_factory=dict)
+    drives: JointDrives | None = None  # drives of the actuated joints
     source: str = ""  # source of the model's numbers
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(self.opening.get(name, math.nan)) for name in self.joints):
+            raise InputError(f"end effector {self.name!r} needs a finite opening position for each of its joints")
+
+    @property
+    def is_gripper(self) -> bool:
+        """True if the end effector has actuated joints."""
+        return bool(self.joints)
 
 
 def _check_robot(name: str, robot: object) -> None:

@@ -18,7 +18,7 @@ from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance_torques
 from guiderail.models.control.wrench import WrenchBound
-from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains, Payload
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 from oracles.plants import six_axes
 
@@ -420,13 +420,45 @@ def test_changed_gains_are_refused_with_another_bound():
         law.system.set_gains(law.context, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7), bound=bound))
 
 
-def test_gains_are_refused_in_the_context_of_a_diagram():
+@pytest.mark.parametrize("changed", ["gains", "payload"])
+def test_parameters_are_refused_in_the_context_of_a_diagram(changed):
     """There, the parameters of another controller would be changed."""
     law, builder = Law(), DiagramBuilder()
     builder.AddSystem(law.system)
     root = builder.Build().CreateDefaultContext()
+    value = law.gains if changed == "gains" else Payload(1.0)
     with pytest.raises(InputError, match=r"pass system\.GetMyMutableContextFromRoot"):
-        law.system.set_gains(root, law.gains)
+        getattr(law.system, f"set_{changed}")(root, value)
+
+
+def test_payload_is_compensated():
+    """A payload of 2 kg at the tool center does not displace the tool if the controller has it as a parameter."""
+    displacements = []
+    for is_known in (True, False):
+        arm = FreeArm(POSTURES[0], time_step=0.005)
+        if is_known:
+            arm.controller.set_payload(arm.controller_context, Payload(2.0))
+        before = arm.pose()
+        arm.push([0.0, 0.0, -2.0 * 9.81])
+        arm.advance(1.0)
+        displacements.append(displacement(before, arm.pose()))
+    known, unknown = (np.abs(each).max() for each in displacements)
+    assert known < 1e-4
+    assert unknown > 0.01
+
+
+def test_center_of_a_payload_is_relative_to_the_tool_center():
+    law = Law()
+    law.system.set_payload(law.context, Payload(1.5, (0.1, 0.0, 0.0)))
+    first = law["generalized_force"].copy()
+    law.system.set_payload(law.context, Payload(1.5, (0.0, 0.1, 0.0)))
+    assert not np.allclose(law["generalized_force"], first, atol=0.1)
+
+
+@pytest.mark.parametrize("arguments", [(-1.0,), (np.inf,), (1.0, (0.0, 0.0)), (1.0, (np.nan, 0.0, 0.0))])
+def test_payload_is_refused_when_out_of_range(arguments):
+    with pytest.raises(InputError, match="payload"):
+        Payload(*arguments)
 
 
 def test_gains_are_copies_that_cannot_be_written_to():

@@ -1,10 +1,15 @@
-"""Behavior of the arm station with every arm: compliance, tracking, insertion."""
+"""Behavior of the arm station with every arm: compliance, tracking, insertion, gripping."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 from pushed_station import PushedStation
+from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties, Box, ProximityProperties
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import CoulombFriction
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import drive_along
@@ -170,6 +175,79 @@ def test_station_raises_when_a_joint_is_not_named():
     )
     with pytest.raises(InputError, match="iiwa_joint_7"):
         ArmStation(WORKCELL, robot=without_last_joint)
+
+
+class BlockOnATable:
+    """Workcell with a block on a table, between the fingers of a gripper, and without a workpiece on the tool."""
+
+    X_WT = RigidTransform([0.5, 0.0, 0.2])
+    WEIGHT = 0.2 * 9.81  # of the block [N]
+
+    def add_fixture(self, plant):
+        friction = CoulombFriction(0.5, 0.5)
+        plant.RegisterCollisionGeometry(
+            plant.world_body(), RigidTransform([0.5, 0.0, 0.155]), Box(0.3, 0.3, 0.05), "table", friction
+        )
+        self.block = plant.AddRigidBody(
+            "block", plant.AddModelInstance("block"), SpatialInertia.SolidBoxWithMass(0.2, 0.04, 0.04, 0.04)
+        )
+        material = ProximityProperties()
+        AddRigidHydroelasticProperties(1.0, material)
+        AddContactMaterial(friction=CoulombFriction(0.8, 0.8), properties=material)
+        plant.RegisterCollisionGeometry(self.block, RigidTransform(), Box(0.04, 0.04, 0.04), "block", material)
+        plant.SetDefaultFloatingBaseBodyPose(self.block, RigidTransform([0.5, 0.0, 0.2]))
+
+    def add_workpiece(self, plant, tool_center):
+        instance = plant.AddModelInstance("placeholder")
+        placeholder = plant.AddRigidBody("placeholder", instance, SpatialInertia.SolidSphereWithMass(1e-3, 0.005))
+        plant.WeldFrames(tool_center, placeholder.body_frame())
+        return placeholder
+
+    def filter_contacts(self, plant, scene_graph):
+        pass
+
+
+@pytest.mark.parametrize("robot", ["panda", "ur5e"])
+def test_gripper_grips_lifts_and_releases(robot):
+    workcell = BlockOnATable()
+    station = ArmStation(workcell, robot=robot, end_effector="parallel_gripper")
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    plant_context = station.plant.GetMyContextFromRoot(context)
+    station.set_pose(context, np.zeros(6))
+    desired = station.get_desired_pose_input_port().FixValue(context, np.zeros(6))
+    state = station.get_gripper_state_output_port()
+    simulator.Initialize()
+    np.testing.assert_allclose(state.Eval(context), [0.04, 0.0])
+
+    def block_height():
+        return workcell.block.EvalPoseInWorld(plant_context).translation()[2]
+
+    simulator.AdvanceTo(0.2)  # open by default, while the input port has no value
+    assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-4)
+    fingers = station.get_gripper_position_input_port().FixValue(context, [0.0])
+    simulator.AdvanceTo(0.7)
+    assert state.Eval(context)[0] == pytest.approx(0.02, abs=5e-4)  # half of the block's width [m]
+    force = station.plant.get_net_actuation_output_port(station.arm.tool_model).Eval(plant_context)
+    np.testing.assert_allclose(force, [-60.0], atol=1e-6)  # effort limit of the finger's motor [N]
+    desired.GetMutableData().set_value([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    simulator.AdvanceTo(2.2)
+    fingers.GetMutableData().set_value([np.nan])  # NaN leaves the last command unchanged
+    simulator.AdvanceTo(2.5)
+    assert block_height() > 0.28
+    wrench = station.get_wrench_output_port().Eval(context)
+    assert wrench[2] == pytest.approx(-workcell.WEIGHT, abs=0.05)
+    assert np.abs(wrench[:2]).max() < 0.05
+    fingers.GetMutableData().set_value([1.0])  # clipped to the upper limit of 0.04 m
+    simulator.AdvanceTo(3.2)
+    assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-3)
+    assert block_height() < 0.21
+
+
+def test_rigid_tool_has_no_gripper_ports():
+    station = ArmStation(WORKCELL)
+    assert not station.HasInputPort("gripper_position")
+    assert not station.HasOutputPort("gripper_state")
 
 
 def test_inverse_kinematics_reaches_a_tilted_pose():

@@ -1,4 +1,4 @@
-"""Mounting of robots and end effectors in a plant: refusals and model files."""
+"""Mounting of robots and end effectors in a plant: refusals, model files, and rigid models for a controller."""
 
 import dataclasses
 import re
@@ -13,20 +13,20 @@ from guiderail.models.robots.mounting import add_end_effector, add_robot, lighte
 from guiderail.models.robots.robot import find_end_effector, find_robot
 
 UR5E = find_robot("ur5e")
-TOOL = find_end_effector("connector_tool")
+GRIPPER = find_end_effector("parallel_gripper")
 
 
-def mount(end_effector, robot=UR5E):
+def mount(end_effector, robot=UR5E, **options):
     """Return a finalized plant, the arm and the end effector."""
     plant = MultibodyPlant(0.005)
     arm = add_robot(plant, robot)
-    tool = add_end_effector(plant, robot, arm, end_effector)
+    tool = add_end_effector(plant, robot, arm, end_effector, **options)
     plant.Finalize()
     return plant, arm, tool
 
 
 def test_add_robot_returns_actuators_in_the_order_of_joints():
-    plant, arm, _ = mount(TOOL)
+    plant, arm, _ = mount(find_end_effector("connector_tool"))
     assert [actuator.joint().name() for actuator in arm.actuators] == list(UR5E.joints)
     q = np.arange(6) / 10
     context = plant.CreateDefaultContext()
@@ -96,6 +96,25 @@ def test_lighten_rotors_scales_the_rotor_inertia():
     lighten_rotors(robot, arm)
     after = [actuator.default_reflected_inertia() for actuator in arm.actuators]
     assert after == pytest.approx([0.25 * inertia for inertia in before])
+
+
+def test_add_end_effector_as_rigid_adds_one_body():
+    plant, _, tool = mount(GRIPPER)
+    rigid_plant, _, rigid = mount(GRIPPER, as_rigid=True)
+    assert rigid_plant.num_positions() == 6
+    assert not rigid.actuators
+    context, rigid_context = plant.CreateDefaultContext(), rigid_plant.CreateDefaultContext()
+    bodies = [body.index() for body in tool.bodies]
+    M = plant.CalcSpatialInertia(context, tool.bodies[0].body_frame(), bodies)
+    rigid_M = rigid.bodies[0].CalcSpatialInertiaInBodyFrame(rigid_context)
+    np.testing.assert_allclose(rigid_M.CopyToFullMatrix6(), M.CopyToFullMatrix6(), atol=1e-12)
+    np.testing.assert_allclose(
+        rigid.tool_center.CalcPoseInWorld(rigid_context).GetAsMatrix4(),
+        tool.tool_center.CalcPoseInWorld(context).GetAsMatrix4(),
+        atol=1e-12,
+    )
+    # Both fingers are open; the right finger mimics the left one.
+    np.testing.assert_allclose(plant.GetPositions(context, tool.model), [0.04, 0.04])
 
 
 DIRECTIVES = """
@@ -173,23 +192,23 @@ def test_add_robot_refuses_missing_and_invalid_models(tmp_path):
     [
         ({"mount_frame": "flange"}, "has no frame 'flange'"),
         ({"tool_center": "tip"}, "has no frame 'tip'"),
-        ({"bodies": ("tool_body", "thumb")}, "has no body 'thumb'"),
+        ({"bodies": ("gripper_body", "thumb")}, "has no body 'thumb'"),
+        ({"opening": {"left_finger_joint": 0.0, "thumb_joint": 0.0}}, "has no joint 'thumb_joint'"),
     ],
 )
-def test_add_end_effector_refuses_data_that_the_model_lacks(fields, reason):
+@pytest.mark.parametrize("as_rigid", [False, True])
+def test_add_end_effector_refuses_data_that_the_model_lacks(fields, reason, as_rigid):
     with pytest.raises(InputError, match=reason):
-        mount(dataclasses.replace(TOOL, **fields))
+        mount(dataclasses.replace(GRIPPER, **fields), as_rigid=as_rigid)
 
 
-def test_add_end_effector_refuses_files_without_one_rigid_model(tmp_path):
-    file, label = tmp_path / "two.dmd.yaml", "end effector 'connector_tool'"
+@pytest.mark.parametrize("as_rigid", [False, True])
+def test_add_end_effector_refuses_files_without_one_model(as_rigid, tmp_path):
+    file = tmp_path / "two.dmd.yaml"
+    label = "end effector 'parallel_gripper'"
     with pytest.raises(InputError, match=f"{label}: there is no model file"):
-        mount(dataclasses.replace(TOOL, model=file))
-    models = (f"- add_model: {{name: {name}, file: 'file://{TOOL.model}'}}\n" for name in ("one", "two"))
+        mount(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
+    models = (f"- add_model: {{name: {name}, file: 'file://{GRIPPER.model}'}}\n" for name in ("one", "two"))
     file.write_text("directives:\n" + "".join(models))
     with pytest.raises(InputError, match=f"{label}: .* must contain one model, not 2"):
-        mount(dataclasses.replace(TOOL, model=file))
-    moving = tmp_path / "moving.urdf"
-    moving.write_text(re.sub('type="fixed"', 'type="continuous"', TOOL.model.read_text(), count=1))
-    with pytest.raises(InputError, match=f"{label}: joint .* moves, and a tool is rigid"):
-        mount(dataclasses.replace(TOOL, model=moving))
+        mount(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)

@@ -45,7 +45,7 @@ def arm(request):
 
 def test_registry_contains_the_robots_of_the_package():
     assert tuple(robot_names()) == ROBOTS
-    assert end_effector_names() == ["connector_tool"]
+    assert end_effector_names() == ["connector_tool", "parallel_gripper"]
     assert find_robot("panda") is find_robot(find_robot("panda"))
 
 
@@ -56,8 +56,8 @@ def test_find_robot_suggests_the_nearest_name(name, suggestion):
 
 
 def test_find_end_effector_suggests_the_nearest_name():
-    with pytest.raises(InputError, match="no end effector 'connector': did you mean connector_tool"):
-        find_end_effector("connector")
+    with pytest.raises(InputError, match="no end effector 'gripper': did you mean parallel_gripper"):
+        find_end_effector("gripper")
 
 
 @pytest.mark.parametrize("robot", [None, type("Arm", (), {"name": "arm"})])
@@ -99,6 +99,14 @@ def test_entry_point_of_an_installed_package_adds_a_robot(tmp_path, monkeypatch)
 def test_robot_refuses_invalid_data(fields, reason):
     with pytest.raises(InputError, match=reason):
         dataclasses.replace(find_robot("ur5e"), **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"), [({"opening": {}}, "opening"), ({"opening": {"left_finger_joint": np.inf}}, "opening")]
+)
+def test_end_effector_refuses_invalid_data(fields, reason):
+    with pytest.raises(InputError, match=reason):
+        dataclasses.replace(find_end_effector("parallel_gripper"), **fields)
 
 
 def test_drives_are_critically_damped():

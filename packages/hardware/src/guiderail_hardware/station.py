@@ -136,7 +136,7 @@ class HardwareStation(Station):
             period: Period of a command [s]; the driver's by default.
             wrench_time_constant: Time constant of the wrench estimate's low-pass filter [s].
             robot_timeout: Longest time that `start` waits for the robot [s].
-            end_effector: Tool on the flange, or its name.
+            end_effector: Tool on the flange, or its name; a gripper is modeled open and is not commanded.
             robot: The arm, or its name.
             robot_url: Address of the robot: LCM's URL, or a host; LCM's default if empty.
             limits: Limits of measurements and torques; `safety_limits` by default.

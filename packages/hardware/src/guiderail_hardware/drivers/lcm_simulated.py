@@ -70,7 +70,7 @@ class SimulatedIiwa(Diagram):
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
 
         def add(plant: MultibodyPlant) -> ArmModel:
-            arm = add_arm(plant, workcell, IIWA14)
+            arm = add_arm(plant, workcell, IIWA14, as_rigid=True)
             follow_directives(plant, directives)
             return arm
 
