@@ -141,6 +141,23 @@ def output(
     return system.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets(system, sources))
 
 
+def abstract_output(
+    system: LeafSystem,
+    name: str,
+    model: AbstractValue,
+    value: Callable[[Context], object],
+    sources: Iterable[Source],
+) -> OutputPort:
+    """Declare an abstract output port of the type of `model`; `value` computes its value from `sources`."""
+
+    def calc(context: Context, output_value: AbstractValue) -> None:
+        output_value.set_value(value(context))
+
+    return system.DeclareAbstractOutputPort(
+        name, alloc=model.Clone, calc=calc, prerequisites_of_calc=tickets(system, sources)
+    )
+
+
 def scalar_output(
     system: LeafSystem, name: str, value: Callable[[Context], float], sources: Iterable[Source]
 ) -> OutputPort:
