@@ -36,6 +36,7 @@ def test_conditions_are_steps_and_changes_of_each_engine():
     names = [condition.name for condition in found]
     assert names[:5] == ["Drake, 5 ms", "Drake, 2.5 ms", "Drake, 1.25 ms", "MuJoCo, 1 ms", "MuJoCo, 0.5 ms"]
     assert names[8:] == [f"MuJoCo, 1 ms, {change}" for change in ("friction × 0.5", "friction × 2", "clearance × 0.5")]
+    assert found[1].environment == conditions("BncConnector", HARD, (2.5,), "drake")[0].environment
     assert found[4].environment == {**HARD, "station": "mujoco", "engine_step": 0.0005}
     assert found[9].environment["disturbances.friction_factor"] == (2.0, 2.0)
     assert found[7].environment["bore_clearance"] == pytest.approx(0.05e-3)
