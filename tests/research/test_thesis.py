@@ -71,7 +71,7 @@ def test_option_difference_is_described_with_both_values(changed, words):
 OTHER_VALUES = {
     "offset_range": (0.0, 0.001), "action_dims": (0,), "gains": (1.0, 1.0),
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
-    "time_step": 0.005, "control_period": 0.1, "disturbances.clock_factor": 2.0,
+    "time_step": 0.005, "engine_step": 0.0005, "control_period": 0.1, "disturbances.clock_factor": 2.0,
     "robot": "other.urdf", "end_effector": "other", "robot_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
     "force_limit_range": (12.0, 12.0), "sensing.wrench_scale": (0.5, 2.0),

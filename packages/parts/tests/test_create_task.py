@@ -70,7 +70,6 @@ def folder(tmp_path_factory):
     parent = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(parent)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_map, "TOUCHES", 30)  # enough to find the socket of this peg
         patch.setattr(contact, "MIN_SPEED", 0.0)
         call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
     yield parent / "peg"
@@ -459,6 +458,7 @@ def test_unchecked_demonstrations_are_not_reported_as_failed(counts, stored, sen
     monkeypatch.setattr(trial, "num_components", lambda folder, file: 3)
     monkeypatch.setattr(trial, "write_preview", lambda *arguments: None)
     file, choice, logged = read_task_file(folder), SimpleNamespace(aligned=None), []
+    shutil.copy(folder / file.plug.visual, tmp_path)
     refusal = pytest.raises(InputError, match="none of the 3 checked demonstrations seats the plug")
     with refusal if stored is None else nullcontext():
         measured = create_task_module._write_task(
@@ -695,7 +695,7 @@ def test_search_inserts_with_the_estimated_socket(folder):
         observation, _, terminated, truncated, info = env.step(search(observation))
         done = terminated or truncated
     assert info["is_success"]
-    assert np.abs(observation[11:13]).max() < 0.2  # the plug is where the socket was estimated
+    assert np.abs(observation[11:13]).max() < 0.4  # the plug is about where the socket was estimated
     assert max(observation[25], observation[27]) < 0.1 * uncertainty
     env.close()
 
