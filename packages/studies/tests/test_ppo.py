@@ -5,40 +5,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gymnasium import spaces
-from spaces_only_env import SpacesOnlyEnv
+from random_episodes import learn, make_learner
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import LEARNERS, learner_arguments
+from guiderail.tools.learning.learner import learner_arguments
 from guiderail.tools.learning.learner_config import make_config, resolve_preset
 
 SETTINGS = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
 OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
 
 
-def make(config, seed=0):
-    return LEARNERS.get(config.algorithm)(config, SpacesOnlyEnv(), action_repeat=1, seed=seed, max_transitions=80)
-
-
-def learn(learner, episodes, rng, length=7):
-    """Train on random episodes; return the learner's actions."""
-    actions = []
-    for _ in range(episodes):
-        learner.on_episode_start()
-        observation = rng.uniform(-1, 1, 3).astype(np.float32)
-        for step in range(length):
-            action = learner.act(observation)
-            next_observation, is_last = rng.uniform(-1, 1, 3).astype(np.float32), step == length - 1
-            learner.on_step(Transition(observation, action, float(rng.normal()), next_observation, False, is_last, {}))
-            actions.append(action)
-            observation = next_observation
-        learner.on_episode_end({"success": 0})
-    return np.array(actions)
-
-
 def test_learner_acts_learns_and_resumes_bit_for_bit():
     config = resolve_preset(None, "ppo", SETTINGS)
-    learner = make(config)
+    learner = make_learner(config)
     before = learner.policy({"observation_shape": [3]})(OBSERVATION)
     rng = np.random.default_rng(0)
     learn(learner, 4, rng)
@@ -46,7 +26,7 @@ def test_learner_acts_learns_and_resumes_bit_for_bit():
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     expected = learn(learner, 3, np.random.default_rng(1))
-    restored = make(config, seed=9)
+    restored = make_learner(config, seed=9)
     restored.restore(arrays, values)
     np.testing.assert_array_equal(learn(restored, 3, np.random.default_rng(1)), expected)
     policies = [each.policy({"observation_shape": [3]}) for each in (learner, restored)]
@@ -56,14 +36,14 @@ def test_learner_acts_learns_and_resumes_bit_for_bit():
 
 def test_exported_policy_acts_as_the_model():
     config = resolve_preset(None, "ppo", SETTINGS)
-    learner = make(config)
+    learner = make_learner(config)
     learn(learner, 5, np.random.default_rng(0))
     expected = learner.model.predict(OBSERVATION, deterministic=True)[0]
     np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
 
 
 def test_settings_reach_the_algorithm():
-    ppo = make(make_config("ppo", {"n_epochs": 3, "n_steps": 32, "ent_coef": 0.1}))
+    ppo = make_learner(make_config("ppo", {"n_epochs": 3, "n_steps": 32, "ent_coef": 0.1}))
     assert (ppo.model.n_epochs, ppo.model.n_steps, ppo.model.ent_coef) == (3, 32, 0.1)
     with pytest.raises(InputError, match="preset tqc_fast has settings that ppo does not have"):
         resolve_preset("tqc_fast", "ppo")
@@ -71,7 +51,7 @@ def test_settings_reach_the_algorithm():
 
 def test_learner_bootstraps_a_time_limit():
     """By hand: with γ = 1, the stored reward of a truncated step is its reward plus the next state's value."""
-    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "net_arch": "4"}))
+    learner = make_learner(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "net_arch": "4"}))
     next_observation = np.full(3, 0.5, np.float32)
     value = float(learner._value(next_observation))
     for truncated, terminated, expected in ((True, False, 2.0 + value), (False, True, 2.0)):
@@ -83,7 +63,7 @@ def test_learner_bootstraps_a_time_limit():
 
 
 def test_learner_bootstraps_before_a_failed_simulation():
-    learner = make(make_config("ppo", {"n_steps": 8, "gamma": 0.5, "net_arch": "4"}))
+    learner = make_learner(make_config("ppo", {"n_steps": 8, "gamma": 0.5, "net_arch": "4"}))
     reached, failure = np.full(3, 0.5, np.float32), {"simulation_failure": "diverged"}
     buffer = learner.model.rollout_buffer
     for is_last, expected in ((False, 2.0 + 0.5 * float(learner._value(reached))), (True, 2.0)):
@@ -96,7 +76,7 @@ def test_learner_bootstraps_before_a_failed_simulation():
 
 
 def test_learner_discards_the_action_before_a_failure():
-    learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
+    learner = make_learner(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
     learner.on_episode_start()
     failure = {"simulation_failure": "no solution"}
     learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 0.0, OBSERVATION, False, True, failure))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from spaces_only_env import SpacesOnlyEnv
+from random_episodes import learn, make_learner
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import LEARNERS, Learner
+from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
 from guiderail.tools.learning.off_policy import TD3_NOISE
@@ -20,30 +20,10 @@ ALGORITHMS = ["td3", "crossq"]
 OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
 
 
-def make(config, seed=0):
-    return LEARNERS.get(config.algorithm)(config, SpacesOnlyEnv(), action_repeat=1, seed=seed, max_transitions=80)
-
-
-def learn(learner, episodes, rng, length=7):
-    """Train on random episodes; return the learner's actions."""
-    actions = []
-    for _ in range(episodes):
-        learner.on_episode_start()
-        observation = rng.uniform(-1, 1, 3).astype(np.float32)
-        for step in range(length):
-            action = learner.act(observation)
-            next_observation, is_last = rng.uniform(-1, 1, 3).astype(np.float32), step == length - 1
-            learner.on_step(Transition(observation, action, float(rng.normal()), next_observation, False, is_last, {}))
-            actions.append(action)
-            observation = next_observation
-        learner.on_episode_end({"success": 0})
-    return np.array(actions)
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
     config = resolve_preset(None, algorithm, OFF_POLICY)
-    learner = make(config)
+    learner = make_learner(config)
     before = learner.policy({"observation_shape": [3]})(OBSERVATION)
     rng = np.random.default_rng(0)
     learn(learner, 4, rng)
@@ -51,7 +31,7 @@ def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     expected = learn(learner, 3, np.random.default_rng(1))
-    restored = make(config, seed=9)
+    restored = make_learner(config, seed=9)
     restored.restore(arrays, values)
     np.testing.assert_array_equal(learn(restored, 3, np.random.default_rng(1)), expected)
     policies = [each.policy({"observation_shape": [3]}) for each in (learner, restored)]
@@ -63,14 +43,14 @@ def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
 def test_exported_policy_acts_as_the_model(algorithm):
     """CrossQ's normalization by running statistics is part of the exported layers."""
     config = resolve_preset(None, algorithm, OFF_POLICY)
-    learner = make(replace(config, actor_ema=0.0))
+    learner = make_learner(replace(config, actor_ema=0.0))
     learn(learner, 5, np.random.default_rng(0))
     expected = learner.model.predict(OBSERVATION, deterministic=True)[0]
     np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
 
 
 def test_td3_explores_with_noise():
-    learner = make(resolve_preset(None, "td3", OFF_POLICY))
+    learner = make_learner(resolve_preset(None, "td3", OFF_POLICY))
     actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
     np.testing.assert_allclose(actions.std(axis=0), TD3_NOISE, atol=0.02)
     assert np.abs(actions).max() <= 1.0
@@ -78,7 +58,7 @@ def test_td3_explores_with_noise():
 
 def make_with_demonstrations(fraction, **more_settings):
     settings = {"net_arch": "4", "batch_size": 8, "learning_starts": 50, "demonstration_episodes": 2, **more_settings}
-    return make(resolve_preset(None, "tqc", {**settings, "demonstration_fraction": fraction}))
+    return make_learner(resolve_preset(None, "tqc", {**settings, "demonstration_fraction": fraction}))
 
 
 def fill(learner, episodes, length=5):
@@ -149,7 +129,7 @@ def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
     config = resolve_preset(
         None, algorithm, {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "net_arch.dropout": 0.5}
     )
-    learner = make(config)
+    learner = make_learner(config)
     learn(learner, 4, np.random.default_rng(0))
     critic = learner.model.critic
     assert any(isinstance(layer, DroppedNormalizedReLU) for layer in critic.q_networks[0])
@@ -167,7 +147,7 @@ def test_configuration_is_restored_from_its_values():
 
 def test_probability_of_an_action_grows_over_base_motion_steps():
     settings = {"net_arch": "8", "learning_starts": 10_000, "exploration.base_motion_steps": 2000}
-    learner = make(resolve_preset(None, "sac", settings))
+    learner = make_learner(resolve_preset(None, "sac", settings))
     learner._constant_action = None
     fractions = []
     for learner.transitions in (0, 1000, 2000):
