@@ -447,7 +447,7 @@ STATE_WORDS = {
 
 KINDS_NOTES = {
     "active_constraints": "They are applied in the order of the file. No kind bounds the rotation about F's z axis "
-    "(yaw) to a range: `fixed_orientation`, `tilt_limits`, `tilt_by_distance` and `arc` determine it. "
+    "(yaw) to a range: `fixed_orientation`, `tilt_limits` and `tilt_by_distance` determine it. "
     "Without any of them the orientation is free.\n\n",
     "input_mapping": "For all inputs, a command moves no faster than `max_speed_m_per_s` and "
     "`max_speed_rad_per_s`.\n\n",

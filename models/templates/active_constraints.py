@@ -391,39 +391,6 @@ class TiltByDistance(TiltConstraint):
         return tilt, tilt
 
 
-@register(ACTIVE_CONSTRAINTS, "arc")
-@dataclass(frozen=True)
-class Arc(FrameConstraint):
-    """Circle about F's z axis; E turns with its angle on the circle, as for a door handle.
-
-    At angle 0 the end effector is above, below or on F's positive x axis, with R_FE = rpy_deg.
-    """
-
-    frame: str  # F: frame of an object, or `world`
-    radius_m: float  # radius of the circle
-    height_m: float = 0.0  # height of the circle along F's z axis
-    min_deg: float = -180.0  # lower bound of the angle
-    max_deg: float = 180.0  # upper bound of the angle
-    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at angle 0
-
-    def __post_init__(self) -> None:
-        require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
-        for name in ("radius_m", "height_m"):
-            require_finite(getattr(self, name), name)
-        require_three(self.rpy_deg, "rpy_deg")
-        require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
-
-    @override
-    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = math.radians(self.min_deg), math.radians(self.max_deg)
-        angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (lower + upper))
-        angle = min(max(angle, lower), upper)
-        c, s = math.cos(angle), math.sin(angle)
-        # A matrix, because Drake's rotations refuse an angle of NaN.
-        R_FArc = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return R_FArc.dot(matrix_deg(self.rpy_deg)), np.array([self.radius_m * c, self.radius_m * s, self.height_m])
-
-
 class _Tangent(HalfSpace):
     """Half-space at a shape's surface, with an offset that is not finite if the pose of an object is not finite."""
 

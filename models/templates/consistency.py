@@ -3,7 +3,7 @@
 Constraints are compared only with constraints in the same frame, because objects move. A set is reported as
 contradictory only if one of these statements is true:
 
-- Two orientations, tilts or angles of an arc are disjoint.
+- Two orientations or tilts are disjoint.
 - All positions that one constraint allows are inside the region that another constraint excludes.
 - The convex parts of the constraints on the position are separated by half-spaces. Let P_i be the projection onto the
   set i, p the approximate minimum of the sum of squared distances from all sets, n_i = p − P_i(p) the normals at p, and
@@ -22,7 +22,6 @@ import numpy as np
 from guiderail.models.templates.active_constraints import (
     UNBOUNDED,
     ActiveConstraint,
-    Arc,
     Box,
     Cylinder,
     FixedOrientation,
@@ -79,9 +78,6 @@ def _have_disjoint_orientations(a: FrameConstraint, b: FrameConstraint) -> bool:
         if tilts[0].turns_along != tilts[1].turns_along:
             return _gap(*_magnitude_range(low, high), *_magnitude_range(other_low, other_high)) > CLEAR
         return min(_gap(low, high, other_low + turn, other_high + turn) for turn in (-math.tau, 0, math.tau)) > CLEAR
-    arcs = [constraint for constraint in (a, b) if isinstance(constraint, Arc)]
-    if len(arcs) == 1 and len(tilts) == 1 and arcs[0].rpy_deg == tilts[0].rpy_deg:
-        return _magnitude_range(*_tilt_range(tilts[0]))[0] > CLEAR  # the orientation on an arc is not tilted
     return False
 
 
@@ -95,11 +91,6 @@ def _angle_to(constraint: FrameConstraint, R_FE: np.ndarray) -> float:
         tilt = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2])
         twist = 0.0 if constraint.turns_along else abs(float(R[1, 0] - R[0, 1])) / 2.0
         return max(_gap(tilt, tilt, *_magnitude_range(*_tilt_range(constraint))), twist)
-    if isinstance(constraint, Arc):
-        R = R_FE @ matrix_deg(constraint.rpy_deg).T
-        tilt, angle = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2]), math.atan2(R[1, 0], R[0, 0])
-        low, high = math.radians(constraint.min_deg), math.radians(constraint.max_deg)
-        return max(tilt, min(_gap(angle + turn, angle + turn, low, high) for turn in (-math.tau, 0, math.tau)))
     return 0.0
 
 
@@ -130,7 +121,7 @@ def _is_excluded(inner: FrameConstraint, outer: FrameConstraint) -> bool:
         if isinstance(inner, Box):
             return all(outer.shape.distance(corner) < -CLEAR for corner in _corners(inner))
         return False
-    least = outer.min_radius_m if isinstance(outer, Cylinder) else outer.radius_m if isinstance(outer, Arc) else 0.0
+    least = outer.min_radius_m if isinstance(outer, Cylinder) else 0.0
     return _largest_radius(inner) < least - CLEAR
 
 
@@ -142,8 +133,6 @@ def _largest_radius(constraint: FrameConstraint) -> float:
     """Return an upper bound of the distance from F's z axis [m] of the positions that a constraint allows."""
     if isinstance(constraint, Cylinder):
         return constraint.max_radius_m
-    if isinstance(constraint, Arc):
-        return constraint.radius_m
     if isinstance(constraint, InsideSphere):
         return math.hypot(*constraint.center_m[:2]) + constraint.radius_m
     if isinstance(constraint, Box):
@@ -200,10 +189,6 @@ def _convex_parts(constraints: dict[int, FrameConstraint]) -> Iterator[tuple[tup
         elif isinstance(constraint, Funnel) and radius < UNBOUNDED:
             ceiling = constraint.height_m + constraint.slope * max(0.0, radius - constraint.radius_m)
             yield (number, narrowest), HalfSpace((0.0, 0.0, -1.0), -ceiling).project_position
-        elif isinstance(constraint, Arc):
-            r, z = constraint.radius_m, constraint.height_m
-            yield (number,), Cylinder(constraint.frame, 0.0, r).project_position
-            yield (number,), Box((-r, -r, z), (r, r, z)).project_position
 
 
 def _above(height_m: float) -> Projection:

@@ -134,50 +134,9 @@ class TiltTowards(InputMapping):
         return RigidTransform(axis_angle_rotation(axis_W, along * self.speed_rad_per_s * period_s), np.zeros(3))
 
 
-class ScaledMapping(InputMapping):
-    """Another mapping with scaled inputs."""
-
-    of: InputMapping
-
-    @property
-    @override
-    def used_inputs(self) -> tuple[int, ...]:
-        return self.of.used_inputs
-
-    @property
-    @override
-    def frame_names(self) -> tuple[str, ...]:
-        return (*super().frame_names, *self.of.frame_names)
-
-
-@register(INPUT_MAPPINGS, "scaled")
-@dataclass(frozen=True)
-class Scaled(ScaledMapping):
-    """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
-
-    frame: str  # frame to which the distance is measured: frame of an object, or `world`
-    distance_m: tuple[float, ...]  # distances to the frame's origin, increasing
-    factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between, constant beyond
-    of: InputMapping  # mapping whose inputs are scaled, an entry with its own kind
-
-    def __post_init__(self) -> None:
-        _require_object(self.frame)
-        require(
-            len(self.distance_m) == len(self.factor) >= 1 and np.all(np.diff(self.distance_m) > 0),
-            "distance_m must increase, with one factor for each distance.",
-        )
-        require(min(self.factor) >= 0 and max(self.factor) <= 1, "every factor must be between 0 and 1.")
-
-    @override
-    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
-        factor = float(np.interp(distance, self.distance_m, self.factor))
-        return self.of.displacement(factor * inputs, X_WE, frames, period_s)
-
-
 @register(INPUT_MAPPINGS, "uneven")
 @dataclass(frozen=True)
-class Uneven(ScaledMapping):
+class Uneven(InputMapping):
     """Another mapping with different factors for positive and negative inputs.
 
     Random inputs move the end effector in the faster direction on average; a zero input commands no motion. With equal
@@ -190,6 +149,16 @@ class Uneven(ScaledMapping):
 
     def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
+
+    @property
+    @override
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.of.used_inputs
+
+    @property
+    @override
+    def frame_names(self) -> tuple[str, ...]:
+        return self.of.frame_names
 
     @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:

@@ -13,12 +13,8 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.active_constraints import TiltLimits
 from guiderail.models.templates.parts import (
     TRANSITION_DISTANCES,
-    WORLD,
     Frames,
     StatePart,
-    axes,
-    chord_angle,
-    matrix_deg,
     position_in,
     register,
     require,
@@ -105,21 +101,3 @@ class TiltToGo(TransitionDistance):
     @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return math.radians(self.until_deg) - self._any_tilt.tilt(X_WE, frames)
-
-
-@register(TRANSITION_DISTANCES, "rotation_to_go")
-@dataclass(frozen=True)
-class RotationToGo(TransitionDistance):
-    """Angle between the end effector's orientation and a given orientation."""
-
-    rpy_deg: tuple[float, ...]  # given orientation R_FE
-    frame: str = WORLD  # F: frame of an object, or `world`
-    unit = "deg"
-    can_be_negative = False
-
-    def __post_init__(self) -> None:
-        require_three(self.rpy_deg, "rpy_deg")
-
-    @override
-    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
-        return chord_angle(X_WE.rotation().matrix(), axes(self.frame, frames) @ matrix_deg(self.rpy_deg))

@@ -191,7 +191,7 @@ states:
   far:
     input_mapping:
       - {kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.06, frame: tool}
-      - {kind: scaled, frame: b, distance_m: [0.05, 0.1, 0.3], factor: [0.2, 0.7, 1.0],
+      - {kind: uneven, above: 0.9, below: 0.7,
          of: {kind: uneven, above: 0.5, below: 0.9,
               of: {kind: rotation, inputs: [3, 4, 5], speed_rad_per_s: 0.5, frame: a}}}
     active_constraints:
@@ -225,9 +225,9 @@ states:
       - {kind: translation, inputs: [2], speed_m_per_s: 0.03, frame: a, axes: [[0, 0, 1]]}
     active_constraints:
       - {kind: box, frame: a, lower_m: [-0.05, -0.05, -0.02], upper_m: [0.05, 0.05, 0.06]}
-    transition_distance: {kind: rotation_to_go, rpy_deg: [0, 0, 40], frame: a}
-    starts_at_deg: 60
-    ends_at_deg: 2
+    transition_distance: {kind: height, frame: a}
+    starts_at_m: 0.06
+    ends_at_m: 0.01
 """
 
 
@@ -242,28 +242,6 @@ def _every_kind(state: str, steps: int) -> Files:
     X_WE = frames["a"] @ RigidTransform(rpy_rotation(0.0, 0.1, 0.0), p_AE)
     start = transform_to_pose(template.project(template.initial_state, X_WE, frames))
     return _template(template, frames, steps, start, limit=0.05)
-
-
-def template_arc(steps: int) -> Files:
-    template = parse_template("""
-name: door
-inputs: 3
-frames: [hinge]
-max_speed_m_per_s: 0.3
-max_speed_rad_per_s: 1.5
-initial_state: open
-states:
-  open:
-    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.25}]
-    active_constraints:
-      - {kind: arc, frame: hinge, radius_m: 0.2, height_m: 0.05, min_deg: -60, max_deg: 80, rpy_deg: [10, 20, 30]}
-    transition_distance: {kind: tilt_to_go, frame: hinge, until_deg: 30}
-    starts_at_deg: 60
-    ends_at_deg: 2
-""")
-    X_WF = RigidTransform(rpy_rotation(0.2, 0.1, 0.3), [0.3, 0.1, 0.2])
-    start = X_WF @ RigidTransform(rpy_rotation(*np.deg2rad([10, 20, 30])), [0.2, 0.0, 0.05])
-    return _template(template, {"hinge": X_WF}, steps, transform_to_pose(start), limit=0.1)
 
 
 def policy(steps: int) -> Files:
@@ -432,7 +410,6 @@ LAWS: dict[str, Callable[[int], Files]] = {
     "template of every kind, far": lambda steps: _every_kind("far", steps),
     "template of every kind, near": lambda steps: _every_kind("near", steps),
     "template of every kind, turn": lambda steps: _every_kind("turn", steps),
-    "template with an arc": template_arc,
     "constraints on a velocity": lambda steps: _shipped("pouring", steps, velocity=True),
     "policy": policy,
     "governor": governor,

@@ -35,16 +35,15 @@ states:
   one:
     input_mapping:
       - {kind: rotation, inputs: [0, 1], axes: [[0, 0, 1], [1, p, 0]], speed_rad_per_s: q, frame: tool}
-      - {kind: scaled, frame: a, distance_m: [0, p], factor: [0, 1],
-         of: {kind: uneven, above: 0.1, below: 1, of: {kind: translation, inputs: [2, 3, 4], speed_m_per_s: 1}}}
+      - {kind: uneven, above: 0.1, below: 1, of: {kind: translation, inputs: [2, 3, 4], speed_m_per_s: 1}}
     active_constraints:
       - {kind: half_space, frame: a, normal: [0, p, 1], offset_m: -1}
       - {kind: box, lower_m: [-1, -1, -1], upper_m: [1, q, 1]}
       - {kind: funnel, frame: b, radius_m: 0.1, height_m: 0.2, slope: 1}
       - {kind: keep_above, frame: b, height_m: -2, points_m: [[0, 0, 0.1], [0, 0, -0.1]]}
-      - {kind: arc, frame: b, radius_m: p, height_m: 0.1, min_deg: -90, max_deg: 90}
+      - {kind: cylinder, frame: b, max_radius_m: p}
       - {kind: tilt_limits, frame: a, min_deg: 0, max_deg: 10 * q}
-    transition_distance: {kind: rotation_to_go, rpy_deg: [0, 0, 90], frame: a}
+    transition_distance: {kind: tilt_to_go, until_deg: 90, frame: a}
     starts_at_deg: 90
     weight_per_deg: 0.1
     transitions: [{to: two, below_deg: 5 * q}]

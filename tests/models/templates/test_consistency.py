@@ -28,9 +28,6 @@ UPRIGHT = ac.FixedOrientation()
         ([ac.FixedOrientation((0.0, 0.0, 20.0)), ac.TiltLimits("world", -10.0, 10.0)], (0, 1)),  # rotated about z
         ([ac.TiltLimits("world", 0.0, 20.0), ac.TiltByDistance("world", (0.1, 0.2), (40.0, 30.0))], (0, 1)),
         ([ac.TiltLimits("world", 10.0, 20.0), ac.TiltLimits("world", -20.0, -10.0)], (0, 1)),
-        ([ac.TiltLimits("world", 10.0, 20.0), ac.Arc("world", 0.1)], (0, 1)),
-        ([ac.Arc("world", 0.1, 0.0, -90.0, 90.0), ac.FixedOrientation((0.0, 0.0, 120.0))], (0, 1)),
-        ([ac.Arc("world", 0.1), ac.Arc("world", 0.2)], (0, 1)),
         ([BOX, UPRIGHT, ac.KeepAbove(0.5)], (0, 2)),
         ([BOX, ac.KeepAbove(0.01, points_m=((0.0, 0.0, -0.1),)), UPRIGHT], (0, 1, 2)),
         ([BOX, ac.Cylinder("world", 0.2)], (0, 1)),
@@ -54,11 +51,10 @@ def test_find_contradiction_returns_contradictory_constraints(constraints, indic
         [ac.FixedOrientation((0.0, 45.0, 0.0)), ac.TiltLimits("world", -60.0, -30.0)],  # on the other side of the axis
         [ac.TiltLimits("world", -180.0, -179.0), ac.TiltLimits("world", 179.0, 180.0)],
         [ac.TiltLimits("world", 10.0, 20.0), ac.TiltLimits("world", -20.0, -10.0, turns_along=True)],
-        # In each of the next four lists, the sets have a single point or edge in common.
+        # In each of the next three lists, the sets have a single point or edge in common.
         [ac.Box((0.005, -0.05, 0.0), (0.02, 0.05, 0.01)), ac.Cylinder("world", 0.0, 0.005)],
         [ac.HalfSpace((1.0, 0.0, 0.0), 0.1), ac.HalfSpace((-1.0, 0.0, 0.0), -0.1)],
         [ac.Funnel("world", 0.1, 0.1, 0.5), ac.KeepAbove(0.3)],
-        [ac.Arc("world", 0.1), ac.Cylinder("world", 0.1, 0.1), ac.KeepAbove(0.0)],
         # Constraints in different frames are not compared, because objects move.
         [UPRIGHT, ac.FixedOrientation((90.0, 0.0, 0.0), "cup")],
     ],

@@ -204,30 +204,6 @@ def test_tilt_by_distance_interpolates_the_tilt(seed):
     assert (math.degrees(tilt) - expected + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
 
 
-@given(SEEDS)
-def test_arc_projects_position_and_orientation(seed):
-    rng, X_WE, frames, frame = scene(seed)
-    lower = rng.uniform(-180, 170)
-    upper = rng.choice([lower, rng.uniform(lower, 180)])
-    radius, height, rpy = rng.uniform(0.1, 1), rng.standard_normal(), tuple(rng.uniform(-90, 90, 3))
-    constraint = ac.Arc(frame, radius, height, lower, upper, rpy)
-    X_WF = frames[F] if frame == F else RigidTransform()
-    X_FP = X_WF.inverse() @ constraint.project(X_WE, frames)
-    q, p = X_FP.translation(), X_WF.inverse() @ X_WE.translation()
-    assert math.hypot(q[0], q[1]) == pytest.approx(radius)
-    assert q[2] == pytest.approx(height)
-    angle = math.degrees(math.atan2(q[1], q[0]))
-    assert (angle - lower + 1e-6) % 360 <= upper - lower + 2e-6
-    requested = math.degrees(math.atan2(p[1], p[0]))
-    if (requested - lower) % 360 <= upper - lower:
-        assert (angle - requested + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
-    else:
-        distances = [abs((requested - limit + 180) % 360 - 180) for limit in (lower, upper)]
-        assert abs((angle - requested + 180) % 360 - 180) == pytest.approx(min(distances), abs=1e-6)
-    expected = Rotation.from_euler("z", angle, degrees=True) * Rotation.from_euler("xyz", rpy, degrees=True)
-    np.testing.assert_allclose(X_FP.rotation().matrix(), expected.as_matrix(), atol=1e-9)
-
-
 class ShiftAndRotate(ac.ActiveConstraint):
     """Translates by 0.3 m along x and rotates by a given angle [rad] about x."""
 
@@ -276,12 +252,6 @@ def test_nearest_turn_is_within_half_a_turn_of_the_center(center):
         (lambda: ac.TiltByDistance(F, (0.1,), (0.0, 1.0)), "increase"),
         (lambda: ac.TiltByDistance(F, (0.1,), (181.0,)), "between"),
         (lambda: ac.TiltByDistance(F, (0.1,), (-181.0,)), "between"),
-        (lambda: ac.Arc(F, 0.0), "positive"),
-        (lambda: ac.Arc(F, 1.0, min_deg=-181.0), "angles"),
-        (lambda: ac.Arc(F, 1.0, min_deg=10.0, max_deg=9.0), "angles"),
-        (lambda: ac.Arc(F, 1.0, max_deg=181.0), "angles"),
-        (lambda: ac.Arc(F, 1.0, math.nan), "height_m must be finite, not nan"),
-        (lambda: ac.Arc(F, math.inf), "radius_m must be finite"),
         (lambda: ac.HalfSpace((0.0, 0.0, 1.0), math.nan), "offset_m must be finite, not nan"),
         (lambda: ac.HalfSpace((0.0, 0.0, 1.0), "a"), "offset_m must be finite, not 'a'"),
         (lambda: ac.KeepAbove(math.nan), "height_m must be finite"),
@@ -305,8 +275,6 @@ def test_constraint_accepts_limits_at_their_bounds():
     ac.TiltLimits(F, -180.0, 180.0)
     ac.TiltByDistance(F, (0.1,), (180.0,))
     ac.TiltByDistance(F, (0.1,), (-180.0,))
-    ac.Arc(F, 0.1, min_deg=-180.0, max_deg=180.0)
-    assert ac.Arc(F, 0.1).min_deg == -180.0
     assert ac.Cylinder(F).max_radius_m >= 1e3
 
 

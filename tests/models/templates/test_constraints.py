@@ -26,7 +26,6 @@ CONSTRAINTS = [
     ac.OutsideCylinder(frame=F, radius_m=0.3, min_m=-0.2, max_m=0.4, margin_m=0.01),
     ac.OutsideBox(frame=F, lower_m=(-0.3, -0.25, -0.4), upper_m=(0.3, 0.4, 0.2), margin_m=0.02),
     ac.InsideSphere(frame=F, radius_m=0.2, center_m=(0.1, 0.0, -0.1)),
-    ac.Arc(frame=F, radius_m=0.3, height_m=0.1, min_deg=0.0, max_deg=80.0, rpy_deg=(90.0, 0.0, 0.0)),
 ]
 IDS = [f"{type(c).__name__}_{i}" for i, c in enumerate(CONSTRAINTS)]
 

@@ -118,12 +118,10 @@ def test_register_refuses_invalid_kinds_and_names(name, kind, sentence):
 
 TRANSLATION = {"kind": "translation", "inputs": [0, 1], "speed_m_per_s": 0.1}
 TILT_TOWARDS = {"kind": "tilt_towards", "inputs": [0, 1], "speed_rad_per_s": 0.1}
-SCALED = {"kind": "scaled", "distance_m": [0], "factor": [1], "of": {**TILT_TOWARDS, "frame": "cup"}}
 HALF_SPACE = {"kind": "half_space", "offset_m": 0}
 FIXED_ORIENTATION = {"kind": "fixed_orientation"}
 TILT_LIMITS = {"kind": "tilt_limits", "frame": "cup", "min_deg": 0, "max_deg": 1}
 TILT_BY_DISTANCE = {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0], "tilt_deg": [0]}
-ARC = {"kind": "arc", "frame": "cup", "radius_m": 1}
 FINAL_STATE = {
     "input_mapping": [],
     "active_constraints": [],
@@ -195,15 +193,12 @@ RADIUS = (*CONSTRAINT, "min_radius_m")
         (set_value(*MAPPING, value={**TRANSLATION, "inputs": [], "axes": []}), "at least one"),
         (set_value(*MAPPING, value={**TRANSLATION, "axes": [[1, 0], [0, 1]]}), "three numbers"),
         (set_value(*MAPPING, value={**TILT_TOWARDS, "frame": "tool"}), "or world, not tool"),
-        (set_value(*MAPPING, value={**SCALED, "frame": "tool"}), "or world, not tool"),
         (set_value(*CONSTRAINT, value={**HALF_SPACE, "normal": [1e-9, 0, 0]}), "must not be zero"),
         (set_value(*CONSTRAINT, value={**HALF_SPACE, "normal": [0.1] * 3000}), "three numbers"),
         (set_value(*CONSTRAINT, value={**FIXED_ORIENTATION, "rpy_deg": [0, 0]}), "three numbers"),
         (set_value(*CONSTRAINT, value={**TILT_LIMITS, "rpy_deg": [0]}), "three numbers"),
-        (set_value(*CONSTRAINT, value={**ARC, "rpy_deg": [0] * 4}), "three numbers"),
         (set_value(*CONSTRAINT, value={**TILT_BY_DISTANCE, "rpy_deg": []}), "three numbers"),
         (set_value(*FAR, "transition_distance", value={"kind": "distance", "frame": "cup", "point_m": [0]}), "three"),
-        (set_value(*FAR, "transition_distance", value={"kind": "rotation_to_go", "rpy_deg": [0]}), "three"),
         (set_value(*FAR, "transition_distance", value={**TILT_TO_GO, "rpy_deg": [0]}), "three"),
         (set_value(*FAR, "transitions", 0, "to", value=["near"]), "to should be a valid string"),
         (set_value(*FAR, "transitions", value=[]), "ends_at_m is missing"),

@@ -76,16 +76,6 @@ def test_tilt_towards_uses_only_the_input_along_the_bearing():
     )
 
 
-def test_scaled_slows_down_near_the_object():
-    mapping = im.Scaled(
-        frame="mug_tip", distance_m=(0.1, 0.3), factor=(0.2, 1.0), of=im.Translation((0,), 1.0, axes=((1.0, 0.0, 0.0),))
-    )
-    speeds = [
-        mapping.displacement(np.ones(1), in_mug([0.0, -d, 0.0]), MUG, 1.0).translation()[0] for d in (0.05, 0.2, 1.0)
-    ]
-    np.testing.assert_allclose(speeds, [0.2, 0.6, 1.0])
-
-
 def test_uneven_scales_positive_and_negative_inputs_differently():
     mapping = im.Uneven(above=0.4, below=1.0, of=im.Translation((0,), 1.0, axes=((0.0, 0.0, 1.0),)))
     speeds = [mapping.displacement(np.array([u]), RigidTransform(), {}, 1.0).translation()[2] for u in (-1, 0, 0.5, 1)]

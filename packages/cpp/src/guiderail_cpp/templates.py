@@ -18,11 +18,11 @@ from guiderail.models.templates.parts import WORLD, StatePart, matrix_deg
 MAPPINGS: tuple[type, ...] = (mappings.Translation, mappings.Rotation, mappings.TiltTowards)
 CONSTRAINTS: tuple[type, ...] = (
     active.HalfSpace, active.Box, active.Cylinder, active.Sector, active.KeepAbove, active.Funnel,
-    active.FixedOrientation, active.TiltLimits, active.TiltByDistance, active.Arc, active.OutsideSphere,
+    active.FixedOrientation, active.TiltLimits, active.TiltByDistance, active.OutsideSphere,
     active.OutsideCylinder, active.OutsideBox, active.InsideSphere,
 )  # fmt: skip
 DISTANCES: tuple[type, ...] = (
-    transitions.Distance, transitions.Height, transitions.AxisDistance, transitions.TiltToGo, transitions.RotationToGo,
+    transitions.Distance, transitions.Height, transitions.AxisDistance, transitions.TiltToGo,
 )  # fmt: skip
 MAX_INPUTS = 32
 
@@ -76,12 +76,8 @@ def _head(part: StatePart, kinds: tuple[type, ...], frames: Sequence[str]) -> li
 
 def _mapping(mapping: mappings.InputMapping, frames: Sequence[str]) -> list[float]:
     scalings: list[list[float]] = []
-    while isinstance(mapping, mappings.Scaled | mappings.Uneven):
-        if isinstance(mapping, mappings.Uneven):
-            scalings.append([1.0, mapping.above, mapping.below])
-        else:
-            frame = -1 if mapping.frame == WORLD else frames.index(mapping.frame)
-            scalings.append([0.0, frame, *_listed(mapping.distance_m), *_listed(mapping.factor)])
+    while isinstance(mapping, mappings.Uneven):
+        scalings.append([mapping.above, mapping.below])
         mapping = mapping.of
     head = _head(mapping, MAPPINGS, frames)
     is_linear = isinstance(mapping, mappings.Translation)
@@ -122,9 +118,6 @@ def _constraint_numbers(c: Any) -> tuple[Sequence[float], Sequence[float], Seque
         return [float(c.turns_along), *_rotation(c.rpy_deg), *limits], (), ()
     if isinstance(c, active.TiltByDistance):
         return [float(c.turns_along), *_rotation(c.rpy_deg)], c.distance_m, c.tilt_deg
-    if isinstance(c, active.Arc):
-        limits = [math.radians(c.min_deg), math.radians(c.max_deg)]
-        return [c.radius_m, c.height_m, *limits, *_rotation(c.rpy_deg)], (), ()
     if isinstance(c, active.OutsideSphere):
         return [*c.center_m, c.radius_m, 0.0], (), ()
     if isinstance(c, active.OutsideCylinder):
@@ -139,6 +132,4 @@ def _distance_numbers(distance: Any) -> Sequence[float]:
         return distance.point_m
     if isinstance(distance, transitions.TiltToGo):
         return [math.radians(distance.until_deg), float(distance.turns_along), *_rotation(distance.rpy_deg)]
-    if isinstance(distance, transitions.RotationToGo):
-        return _rotation(distance.rpy_deg)
     return ()

@@ -15,10 +15,10 @@ constexpr int kMaxInputs = 32;  // of a template
 // Numbers of the kinds of a template's parts; they are equal to those in guiderail_cpp/templates.py.
 enum class MappingKind { kTranslation, kRotation, kTiltTowards };
 enum class ConstraintKind {
-  kHalfSpace, kBox, kCylinder, kSector, kKeepAbove, kFunnel, kFixedOrientation, kTiltLimits, kTiltByDistance, kArc,
+  kHalfSpace, kBox, kCylinder, kSector, kKeepAbove, kFunnel, kFixedOrientation, kTiltLimits, kTiltByDistance,
   kOutsideSphere, kOutsideCylinder, kOutsideBox, kInsideSphere
 };
-enum class DistanceKind { kDistance, kHeight, kAxisDistance, kTiltToGo, kRotationToGo };
+enum class DistanceKind { kDistance, kHeight, kAxisDistance, kTiltToGo };
 
 constexpr int kTool = -2, kWorld = -1;  // frames that are not those of objects
 
@@ -54,10 +54,7 @@ class Reader {
 // Mapping with the scalings around it, outermost first.
 struct Mapping {
   struct Scaling {
-    bool is_uneven;
-    int frame;
-    std::vector<double> distances, factors;
-    double above, below;
+    double above, below;  // factors of positive and of negative inputs
   };
   std::vector<Scaling> scalings;
   MappingKind kind{};
@@ -69,14 +66,7 @@ struct Mapping {
   explicit Mapping(Reader& reader) {
     for (int n = reader.whole(); n > 0; --n) {
       Scaling scaling{};
-      scaling.is_uneven = reader.next() != 0.0;
-      if (scaling.is_uneven) {
-        scaling.above = reader.next(), scaling.below = reader.next();
-      } else {
-        scaling.frame = reader.whole();
-        scaling.distances = reader.list();
-        scaling.factors = reader.list();
-      }
+      scaling.above = reader.next(), scaling.below = reader.next();
       scalings.push_back(scaling);
     }
     kind = static_cast<MappingKind>(reader.whole());
@@ -238,8 +228,6 @@ class Template {
       case DistanceKind::kHeight: return p[2];
       case DistanceKind::kAxisDistance: return std::hypot(p[0], p[1]);
       case DistanceKind::kTiltToGo: return k[0] - tilt(k[1] != 0.0, matrix(k, 2), heading(p), R);
-      case DistanceKind::kRotationToGo:
-        return angle_between(X.R, d.frame == kWorld ? Mat3{} * matrix(k, 0) : frames_[d.frame].R * matrix(k, 0));
     }
     return 0;
   }
@@ -305,12 +293,7 @@ class Template {
 
   Transform displacement(const Mapping& mapping, std::array<double, kMaxInputs> u, const Transform& X, double period) const {
     for (const Mapping::Scaling& scaling : mapping.scalings) {
-      double factor = 0;
-      if (!scaling.is_uneven) {
-        const double away = norm(position_in(scaling.frame, X));
-        factor = interpolate(away, scaling.distances.data(), scaling.factors.data(), static_cast<int>(scaling.distances.size()));
-      }
-      for (int i = 0; i < inputs_; ++i) u[i] = (scaling.is_uneven ? (u[i] < 0.0 ? scaling.below : scaling.above) : factor) * u[i];
+      for (int i = 0; i < inputs_; ++i) u[i] = (u[i] < 0.0 ? scaling.below : scaling.above) * u[i];
     }
     if (mapping.kind == MappingKind::kTiltTowards) {
       const Vec3 p = position_in(mapping.frame, X), towards = bearing(p);
@@ -511,15 +494,6 @@ class Template {
         R = turned * rest, has_turned = true;
         return;
       }
-      case ConstraintKind::kArc: {
-        double angle = nearest_turn(std::atan2(p[1], p[0]), 0.5 * (k[2] + k[3]));
-        angle = std::isnan(angle) ? angle : std::min(std::max(angle, k[2]), k[3]);
-        const double cosine = std::cos(angle), sine = std::sin(angle);
-        R = Mat3{{cosine, -sine, 0, sine, cosine, 0, 0, 0, 1}} * matrix(k, 4);
-        p = {k[0] * cosine, k[0] * sine, k[1]};
-        has_moved = has_turned = true;
-        return;
-      }
       case ConstraintKind::kInsideSphere: {
         const Vec3 center{k[0], k[1], k[2]}, offset = p - center;
         const double away = std::sqrt(dot(offset, offset));
@@ -533,7 +507,7 @@ class Template {
 
   // Throws std::runtime_error if a number refers to nothing, or a part has too few numbers.
   void check(const Tensor& poses) const {
-    static constexpr std::size_t kConstraint[] = {4, 6, 2, 2, 1, 3, 9, 12, 10, 13, 5, 9, 7, 4}, kDistance[] = {3, 0, 0, 11, 9};
+    static constexpr std::size_t kConstraint[] = {4, 6, 2, 2, 1, 3, 9, 12, 10, 5, 9, 7, 4}, kDistance[] = {3, 0, 0, 11};
     const auto require = [](bool condition) {
       if (!condition) throw std::runtime_error("the template of the skill is damaged: export the skill again");
     };
@@ -548,18 +522,14 @@ class Template {
         for (int input : mapping.inputs) require(input >= 0 && input < inputs_);
         const bool is_tilt = mapping.kind == MappingKind::kTiltTowards;
         require(is_tilt ? mapping.inputs.size() == 2 : mapping.axes.size() == 3 * mapping.inputs.size());
-        for (const Mapping::Scaling& scaling : mapping.scalings) {
-          check_frame(scaling.frame);
-          require(scaling.is_uneven || (!scaling.distances.empty() && scaling.distances.size() == scaling.factors.size()));
-        }
       }
       for (const Constraint& constraint : state.constraints) {
-        require(is_of(constraint.kind, 14) && constraint.numbers.size() >= kConstraint[static_cast<int>(constraint.kind)]);
+        require(is_of(constraint.kind, 13) && constraint.numbers.size() >= kConstraint[static_cast<int>(constraint.kind)]);
         check_frame(constraint.frame);
         require(constraint.kind != ConstraintKind::kKeepAbove || constraint.xs.size() % 3 == 0);
         require(constraint.kind != ConstraintKind::kTiltByDistance || (!constraint.xs.empty() && constraint.xs.size() == constraint.ys.size()));
       }
-      require(is_of(state.distance.kind, 5) && state.distance.numbers.size() >= kDistance[static_cast<int>(state.distance.kind)]);
+      require(is_of(state.distance.kind, 4) && state.distance.numbers.size() >= kDistance[static_cast<int>(state.distance.kind)]);
       check_frame(state.distance.frame);
       for (const Exit& exit : state.exits) require(exit.source >= 0 && exit.source < states() && exit.target >= 0 && exit.target < states());
     }
