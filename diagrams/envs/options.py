@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import fields
-from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
@@ -20,7 +19,6 @@ from pydantic import (
     ConfigDict,
     ValidationError,
     ValidationInfo,
-    create_model,
     field_validator,
 )
 from pydantic import Field as Field
@@ -292,14 +290,8 @@ def validate_options(model: type[Model], values: Mapping[str, Any], context: str
         raise InputError(_format_error(model, error.errors()[0], values, context)) from None
 
 
-@lru_cache(maxsize=128)
-def _tree_of(models: tuple[tuple[str, type[Options]], ...]) -> type[Options]:
-    fields: dict[str, Any] = {part: (model, ...) for part, model in models}
-    return create_model("Tree", __base__=Options, **fields)
-
-
 def validate_tree(models: Mapping[str, type[Options]], values: Mapping[str, Any], context: str) -> dict[str, Options]:
-    """Validate and convert the options of all parts at once; `context` is the subject of an error message.
+    """Validate and convert the options of all parts, in the order of `models`; see `validate_options`.
 
     Args:
         models: Model of each part. A part takes the values whose names it declares.
@@ -309,17 +301,10 @@ def validate_tree(models: Mapping[str, type[Options]], values: Mapping[str, Any]
     Raises:
         InputError: If a value has the wrong type or is out of range.
     """
-    tree = {
-        part: {field: values[name] for name, field in option_fields(model).items() if name in values}
+    return {
+        part: validate_options(model, {name: values[name] for name in option_fields(model) if name in values}, context)
         for part, model in models.items()
     }
-    try:
-        validated = _tree_of(tuple(models.items())).model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        part, *location = first["loc"]
-        raise InputError(_format_error(models[str(part)], {**first, "loc": tuple(location)}, values, context)) from None
-    return {part: getattr(validated, part) for part in models}
 
 
 def check_choice(name: str, value: Any, choices: list[str], context: str) -> str:

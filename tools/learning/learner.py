@@ -16,9 +16,10 @@ from typing import Annotated, Any, ClassVar, Literal, cast
 
 import gymnasium
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass, is_pydantic_dataclass
 
+from guiderail.diagrams.envs.options import Integer
 from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
@@ -37,15 +38,8 @@ LOGGED_COLUMNS = {
 }
 
 
-def reject_bool(value: Any) -> Any:
-    """Return a value; raise a ValueError if it is a bool, because a number is expected."""
-    if isinstance(value, bool):
-        raise ValueError("it must be a number")
-    return value
-
-
-Positive = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(reject_bool)]
-NonNegative = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(reject_bool)]
+Positive = Annotated[Integer, Field(ge=1, le=10**9)]
+NonNegative = Annotated[Integer, Field(ge=0, le=10**9)]
 Symmetries = bool | Literal["near"]
 
 

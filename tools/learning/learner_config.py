@@ -13,11 +13,11 @@ from typing import Annotated, Any, ClassVar, Literal, cast
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
+from guiderail.diagrams.envs.options import Integer, Number, entries_of, flat_options, option_fields
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean, find_plugins
-from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries, reject_bool
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries
 from guiderail.tools.pretrained import PRETRAINED
 
 DEFAULT_PRESET = "tqc_contact"
@@ -36,13 +36,13 @@ def _absolute(run: str) -> str:
 
 
 # Upper bounds exclude values that would exhaust memory or never finish.
-BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
-NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
-Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
-Dropout = Annotated[float, Field(ge=0, lt=1), BeforeValidator(reject_bool)]
-Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
-Noise = Annotated[float, Field(ge=0, le=10), BeforeValidator(reject_bool)]
-Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
+BatchSize = Annotated[Integer, Field(ge=1, le=10**6)]
+NumUnits = Annotated[Integer, Field(ge=1, le=10**4)]
+Fraction = Annotated[Number, Field(ge=0, le=1)]
+Dropout = Annotated[Number, Field(ge=0, lt=1)]
+Factor = Annotated[Number, Field(gt=0, le=1)]
+Noise = Annotated[Number, Field(ge=0, le=10)]
+Rate = Annotated[Number, Field(gt=0, allow_inf_nan=False)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
 # The path is made absolute, so that a run can be resumed from another working directory.
 RunName = Annotated[str, AfterValidator(_absolute)]
