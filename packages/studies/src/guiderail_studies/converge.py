@@ -16,7 +16,7 @@ from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.evaluate import check_num_episodes, evaluate_once
 from guiderail.tools.evaluation.forks import check_processes
-from guiderail.tools.evaluation.metrics import wilson
+from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.subject import Subject, find_subject
 from guiderail.tools.tables import write_table
 
@@ -242,16 +242,8 @@ def plant_step(task: str, environment: Mapping[str, Any]) -> float:
 
 def success_and_force(rows: pd.DataFrame) -> dict[str, Any]:
     """Return success with its interval, and the largest forces of the impedance and of the contact [N]."""
-    successes = int(rows["success"].sum())
-    low, high = wilson(successes, len(rows))
-    return {
-        "episodes": len(rows),
-        "successes": successes,
-        "success_rate": successes / len(rows),
-        "success_low": low,
-        "success_high": high,
-        **{name: float(rows[name].max()) for name in ("peak_force", "peak_contact_force")},
-    }
+    names = ("success_rate", "success_low", "success_high", "peak_force", "peak_contact_force")
+    return {"episodes": len(rows), "successes": int(rows["success"].sum()), **summary(rows, names)}
 
 
 def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
