@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_numbers, is_whole
+from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -93,8 +93,7 @@ class SensorDisturbance(LeafSystem):
         Raises:
             InputError: If `delay` is not a whole number from 1 to the largest delay.
         """
-        if not (is_whole(delay, 1) and delay <= self._delay):
-            raise InputError(f"this sensor's delay must be from 1 to {self._delay} periods, not {delay}")
+        delay = as_whole(delay, "this sensor's delay in periods", 1, self._delay)
         context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
 
     def set_gradient(self, context: Context, gradient: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, OutputPort
 
-from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.termination import EVALUATED, TERMINATIONS, Termination
 from guiderail.systems.support import declarations as declare
@@ -157,8 +157,7 @@ class TerminationTerm:
     def __post_init__(self) -> None:
         if self.termination not in EVALUATED:
             raise InputError(f"an episode can't end as '{self.termination}', only as {', '.join(EVALUATED)}")
-        if not is_whole(self.steps, 1):
-            raise InputError(f"the steps of a condition must be a whole number of at least 1, not {brief(self.steps)}")
+        as_whole(self.steps, "the steps of a condition", 1)
 
 
 class EpisodeMonitor(LeafSystem):

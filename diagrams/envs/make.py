@@ -36,7 +36,8 @@ from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
 from guiderail.diagrams.tasks.registry import content_digest
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.arrays import as_whole
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
@@ -163,8 +164,7 @@ def make_vector_env(num_envs: int = 1, **arguments: Any) -> AsyncVectorEnv:
     Raises:
         InputError: As `make_env`, or if `num_envs` is not a positive whole number.
     """
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-        raise InputError(f"num_envs must be a whole number of environments, at least 1, not {brief(num_envs)}")
+    num_envs = as_whole(num_envs, "num_envs", 1)
     multiprocessing.set_forkserver_preload([__name__])  # imports the module once, not in each process
     return AsyncVectorEnv([partial(make_env, **arguments)] * num_envs, context="forkserver")
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
-from typing import SupportsInt, cast
+from typing import SupportsFloat, SupportsInt, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,24 +27,21 @@ def is_finite(values: np.ndarray) -> bool:
     return all(map(math.isfinite, values.tolist()))
 
 
-def is_whole(value: object, least: float) -> bool:
-    """Return True for a whole number of at least `least`; False for bools, NaN, infinity and other types."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return False
-    if isinstance(value, Integral):
-        return int(value) >= least
-    return float(value).is_integer() and float(value) >= least
+def as_whole(value: object, what: str, least: int | None = None, most: int | None = None) -> int:
+    """Convert a whole number of Python or NumPy, such as 3 or 3.0, to an int from `least` to `most`.
 
-
-def as_whole(value: object, what: str) -> int:
-    """Convert a whole number of Python or NumPy, such as 3 or 3.0, to an int; `what` is its name for the message.
+    Bools and other types are refused; `what` is the number's name for the message.
 
     Raises:
-        InputError: If the value is not a whole number: 1.5, "3" and True are refused.
+        InputError: If the value is anything else: 1.5, "3" and True are refused.
     """
-    if not is_whole(value, -math.inf):
-        raise InputError(f"{what} must be a whole number, not {brief(value)}")
-    return int(cast(SupportsInt, value))
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    is_whole = is_real and (isinstance(value, Integral) or float(cast(SupportsFloat, value)).is_integer())
+    number = int(cast(SupportsInt, value)) if is_whole else None
+    if number is None or (least is not None and number < least) or (most is not None and number > most):
+        bounds = "" if least is None else f" of at least {least}" if most is None else f" from {least} to {most}"
+        raise InputError(f"{what} must be a whole number{bounds}, not {brief(value)}")
+    return number
 
 
 def as_number(value: object, what: str) -> float:

@@ -125,9 +125,7 @@ class Demonstrations:
         """
         if count is None:
             return self
-        count = as_whole(count, "the number of demonstrations")
-        if not 1 <= count <= self.num_demonstrations:
-            raise InputError(f"choose from 1 to all {self.num_demonstrations} demonstrations, not {count}")
+        count = as_whole(count, "the number of demonstrations", 1, self.num_demonstrations)
         return Demonstrations(self.times[:count], self.outputs[:count], self.names)
 
     def resampled(self, num_steps: int | None = None) -> "Demonstrations":
@@ -142,9 +140,8 @@ class Demonstrations:
         Raises:
             InputError: If `num_steps` is out of range or not a whole number.
         """
-        if num_steps is not None and not 2 <= as_whole(num_steps, "num_steps") <= MAX_STEPS:
-            raise InputError(f"a clock has from 2 to {MAX_STEPS} steps, not {num_steps}")
-        num_steps = max(len(t) for t in self.times) if num_steps is None else int(num_steps)
+        most = max(len(t) for t in self.times)
+        num_steps = most if num_steps is None else as_whole(num_steps, "num_steps", 2, MAX_STEPS)
         first = self.times[0]
         if len(first) == num_steps and all(np.array_equal(t, first) for t in self.times):
             steps = np.diff(first)
@@ -247,15 +244,13 @@ def compute_bounds(
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)
     steps = outputs.shape[1]
-    phases = as_whole(phases, "the number of phases")
-    if not 1 <= phases <= steps // 2:
-        raise InputError(f"{steps} samples can be divided into 1 to {steps // 2} phases, not {phases}")
+    phases = as_whole(phases, "the number of phases", 1, steps // 2)
     if not all(0.0 <= as_number(value, "a margin") < np.inf for value in (margin, min_margin)):
         raise InputError(f"margins must be finite and not negative, not {margin} and {min_margin}")
     chosen = range(outputs.shape[2]) if bounded is None else _as_list(bounded, "bounded")
-    indices = [as_whole(index, "an index of an output") for index in chosen]
-    if not indices or not all(0 <= index < outputs.shape[2] for index in indices):
-        raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {indices}")
+    indices = [as_whole(index, "an index of an output", 0, outputs.shape[2] - 1) for index in chosen]
+    if not indices:
+        raise InputError("bounds are on at least one output: name it in bounded")
     starts = np.arange(phases) / phases
     lower, upper = (np.full((phases, outputs.shape[2]), inf) for inf in (-np.inf, np.inf))
     # Resampling to common times can miss extreme values, so the original samples are included.

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 
 # Importing scikit-learn takes over a second, and reading a file does not need it.
 if TYPE_CHECKING:
@@ -109,10 +108,8 @@ def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
     """Return mixtures and their criteria by number of components; see `information_criteria`."""
-    candidates, seed = [as_whole(count, "components") for count in candidates], as_whole(seed, "seed")
-    for count in candidates:
-        if not 1 <= count <= len(times) // 2:
-            raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")
+    seed, most = as_whole(seed, "seed"), len(times) // 2
+    candidates = [as_whole(count, "the number of components", 1, most) for count in candidates]
     data, _, _ = _standardize(times, outputs)
     phase = np.tile(np.arange(len(times)), len(outputs)) / len(times)  # phase of each sample, from 0 to below 1
     fits: dict[int, tuple[GaussianMixture, float]] = {}

@@ -23,8 +23,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from guiderail.models.common.arrays import as_number, as_whole, is_finite, is_whole
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.arrays import as_number, is_finite
+from guiderail.models.common.errors import InputError
 
 
 class SignalPorts:
@@ -92,17 +92,6 @@ def check_signature(function: Callable[..., Any], signals: Mapping[str, int], wh
             f"{what} is called with the keyword arguments ({', '.join(signals)}), but its function has the parameters "
             f"({', '.join(accepted.parameters)}): give its inputs the names of the parameters"
         ) from None
-
-
-def as_count(value: object, what: str, least: int = 1) -> int:
-    """Return a whole number of at least `least` as an int; `what` is its name in messages.
-
-    Raises:
-        InputError: If the value is anything else.
-    """
-    if not is_whole(value, least):
-        raise InputError(f"{what} must be a whole number of at least {least}, not {brief(value)}")
-    return as_whole(value, what)
 
 
 def check_period(period: float) -> None:

@@ -56,7 +56,7 @@ def test_seed_is_refused_when_out_of_range(seed, bead_run, tmp_path):
         lambda: EpisodeSpec.of_policy(bead_run, seed=seed),
         lambda: evaluate(bead_run, save=tmp_path / "x.npz", seed=seed),
     ):
-        with pytest.raises(InputError, match=f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}"):
+        with pytest.raises(InputError, match=f"a seed must be a whole number from 0 to {2**31 - 1}, not {seed}"):
             use_seed()
 
 

@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 from guiderail.tools.spaces import from_tensors
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
@@ -78,10 +77,7 @@ class EnvCallback(Callback):
 
 def check_seed(seed: object) -> int:
     """Return a seed as an int; raise an InputError if it is not a whole number from 0 to 2^31 - 1."""
-    number = as_whole(seed, "a seed")
-    if not 0 <= number < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {number}")
-    return number
+    return as_whole(seed, "a seed", 0, 2**31 - 1)
 
 
 def has_image(space: Any) -> bool:

@@ -475,11 +475,8 @@ def _print_first(rows: pd.DataFrame, baselines: Sequence[str], seconds: float, *
 
 
 def check_num_episodes(episodes: object) -> int:
-    """Return a number of episodes as an int; raise an InputError if it is no whole number, or less than 1."""
-    number = as_whole(episodes, "the number of episodes")
-    if number < 1:
-        raise InputError(f"an evaluation needs at least one episode, not {number}")
-    return number
+    """Return the number of an evaluation's episodes as an int; raise an InputError unless it is at least 1."""
+    return as_whole(episodes, "the number of episodes", 1)
 
 
 def _episodes_file(

@@ -17,7 +17,6 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 
 Result = TypeVar("Result")
 _PARENT_CHECKS = 0.2  # period of a fork's checks that its parent is alive [s]
@@ -30,12 +29,7 @@ def num_cores() -> int:
 
 def check_processes(processes: int | None) -> int:
     """Return `processes` as an int, or the number of cores for None."""
-    if processes is None:
-        return num_cores()
-    processes = as_whole(processes, "the number of processes")
-    if processes < 1:
-        raise InputError(f"an evaluation needs at least one process, not {processes}")
-    return processes
+    return num_cores() if processes is None else as_whole(processes, "the number of processes", 1)
 
 
 def can_fork() -> bool:

@@ -55,8 +55,7 @@ def rollout(
 
     if not callable(act):
         act = as_policy(act)
-    if seed is not None and (seed := as_whole(seed, "a seed")) < 0:
-        raise InputError(f"a seed is a whole number of at least 0, not {seed}")
+    seed = None if seed is None else as_whole(seed, "a seed", 0)
     base: Any = env.unwrapped
     is_own = hasattr(base, "trace")
     reset_options = None if options is None else dict(options)

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_to_transform, transform_to_pose
@@ -204,8 +204,7 @@ class PrimitiveGuide(Guide):
             raise InputError(f"there is no guidance {brief(guidance)}: {did_you_mean(guidance, GUIDANCE)}")
         if not segments:
             raise InputError("guidance by demonstrations needs at least one segment")
-        if settings.history < 1:
-            raise InputError(f"history is a number of outputs, at least 1, not {settings.history}")
+        as_whole(settings.history, "history", 1)
         for index, segment in enumerate(segments):
             if (number := segment.recorded.num_demonstrations) < MIN_DEMONSTRATIONS:
                 raise InputError(
@@ -351,12 +350,10 @@ def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[i
     """Return the indices of the outputs that an action moves; raise an InputError unless they are distinct indices."""
     if action_dims is None:
         return list(range(num_outputs))
-    dims = list(action_dims)
-    if len(set(dims)) < len(dims) or not all(is_whole(o, 0) and o < num_outputs for o in dims):
-        raise InputError(
-            f"action_dims are distinct indices of the outputs, from 0 to {num_outputs - 1}, not {brief(action_dims)}"
-        )
-    return [int(o) for o in dims]
+    dims = [as_whole(o, "an output in action_dims", 0, num_outputs - 1) for o in action_dims]
+    if len(set(dims)) < len(dims):
+        raise InputError(f"action_dims names an output twice, {brief(action_dims)}: name each output once")
+    return dims
 
 
 def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> Orientation:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from guiderail.models.common.arrays import as_numbers, is_whole
+from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.laws.law import Command, Law
 from guiderail.models.primitives import Demonstrations
@@ -121,8 +121,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     ):
         super().__init__(env)
         self._is_checked = check_env  # False after the first episode
-        if not is_whole(action_repeat, 1):
-            raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
+        action_repeat = as_whole(action_repeat, "action_repeat", 1)
         settings = GuideSettings(action_scale, action_dims, history, history_variance, horizon, orientation)
         if period is not None and not (isinstance(period, Real) and 0.0 < period < np.inf):
             raise InputError(f"the period of the environment must be a positive number of seconds, not {brief(period)}")

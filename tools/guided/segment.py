@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
@@ -137,8 +137,8 @@ class Segment:
 
     def __post_init__(self) -> None:
         for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
-            if value is not None and not least <= value <= MAX_STEPS:
-                raise InputError(f"{what} of a segment is from {least} to {MAX_STEPS}, not {value}")
+            if value is not None:
+                as_whole(value, f"{what} of a segment", least, MAX_STEPS)
         if self.discrete is not None and self.extra is not None:
             raise InputError("a segment has extra or discrete, not both")
 

@@ -241,12 +241,7 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
 
 def check_episodes(episodes: object) -> int:
     """Return a number of episodes as an int; raise an InputError unless it is a whole number in [1, `MAX_EPISODES`]."""
-    episodes = as_whole(episodes, "the number of episodes")
-    if episodes < 1:
-        raise InputError(f"a run needs at least one episode, not {episodes}")
-    if episodes > MAX_EPISODES:
-        raise InputError(f"a run has at most {MAX_EPISODES} episodes, not {episodes}")
-    return episodes
+    return as_whole(episodes, "the number of episodes", 1, MAX_EPISODES)
 
 
 def setting_values(config: LearnerConfig) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from guiderail.diagrams.envs.assemble import template_of
 from guiderail.diagrams.envs.scene import NEWTONS_PER_METER, Scene, contact_forces, in_plane
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
@@ -209,9 +210,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     """
     if environment_id(episode.task) == episode.task:
         raise InputError(f"{episode.task} is an environment of another package, which has no animation of guiderail")
-    episodes = EPISODES if episodes is None else episodes
-    if episodes < 1:
-        raise InputError(f"a page shows at least one episode, not {episodes}")
+    episodes = as_whole(EPISODES if episodes is None else episodes, "the number of episodes", 1)
     check_page(html)
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)

@@ -69,7 +69,7 @@ def test_promp_refuses_invalid_via_points(phase, output, covariance):
 
 
 def test_promp_refuses_too_many_basis_functions():
-    with pytest.raises(InputError, match="between 2 and half"):
+    with pytest.raises(InputError, match="num_basis must be a whole number from 2 to 50, not 51"):
         ProMp.fit(bundle(), 51)
     with pytest.raises(InputError, match="resampled"):
         ProMp.fit(Demonstrations([T, 2.0 * T], [T[:, None], T[:, None]]))

@@ -109,7 +109,7 @@ def test_damaged_results_and_processes_are_refused(tmp_path):
     (tmp_path / "parts.json").write_text("[1]")
     with pytest.raises(InputError, match="is damaged"):
         create_tasks([], tmp_path)
-    with pytest.raises(InputError, match="--processes is at least 1"):
+    with pytest.raises(InputError, match="--processes must be a whole number of at least 1"):
         create_tasks([], tmp_path, processes=0)
 
 

@@ -132,5 +132,5 @@ def test_without_a_calibration_hard_is_the_first_setting_with_the_limits_of_the_
 
 @pytest.mark.parametrize("episodes", [-1, 101])
 def test_calibration_episodes_are_refused_when_out_of_range(episodes, tmp_path):
-    with pytest.raises(InputError, match="--hard-episodes is from 0 to 100"):
+    with pytest.raises(InputError, match="--hard-episodes must be a whole number from 0 to 100"):
         create_task(Path("plug.stl"), Path("socket.stl"), tmp_path / "peg", hard_episodes=episodes)

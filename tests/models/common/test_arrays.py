@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.common.arrays import as_number, as_numbers, is_whole
+from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError
 
 ROUNDED = [[2**53], [2**63], [2**64], [0.5, 2**70], np.array([1, 2**60], dtype=object), [0.5, -(2**53)]]
@@ -46,5 +46,15 @@ def test_as_numbers_converts_objects_to_doubles():
         *((value, False) for value in (0, True, 1.5, np.nan, np.inf, "1", None)),
     ],
 )
-def test_is_whole_accepts_integers_of_any_numeric_type(value, is_accepted):
-    assert is_whole(value, 1) is is_accepted
+def test_as_whole_accepts_integers_of_any_numeric_type(value, is_accepted):
+    if is_accepted:
+        assert as_whole(value, "the count", 1) == value
+    else:
+        with pytest.raises(InputError, match="the count must be a whole number of at least 1, not"):
+            as_whole(value, "the count", 1)
+
+
+def test_as_whole_refuses_numbers_outside_of_a_range():
+    with pytest.raises(InputError, match="the count must be a whole number from 1 to 3, not 4"):
+        as_whole(4, "the count", 1, 3)
+    assert as_whole(3, "the count", 1, 3) == 3

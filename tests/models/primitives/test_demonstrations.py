@@ -173,7 +173,7 @@ def test_max_rates_use_the_clock_of_each_demonstration():
         ({"margin": "a"}, "must be a number, not"),
         ({"margin": None}, "must be a number, not"),
         ({"min_margin": [0.1]}, "must be a number, not"),
-        ({"bounded": [2]}, "outputs are numbered"),
+        ({"bounded": [2]}, "an index of an output must be a whole number from 0 to 1, not 2"),
         ({"bounded": 0}, "bounded must be a list, not 0"),
     ],
 )

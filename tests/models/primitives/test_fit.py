@@ -136,7 +136,7 @@ def test_fit_refuses_too_few_data():
 
 @pytest.mark.parametrize("components", [0, 41, 1000])
 def test_fit_refuses_too_many_components(components, demonstrations):
-    with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
+    with pytest.raises(InputError, match="the number of components must be a whole number from 1 to 40"):
         fit(demonstrations, components=components)
 
 

@@ -137,7 +137,7 @@ def test_constant_output_has_a_spread_independent_of_its_value(height):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"components": 61}, "components must be between 1 and half the number of steps, 60: 61"),
+        ({"components": 61}, "the number of components must be a whole number from 1 to 60, not 61"),
         ({"demonstrations": hourglass(1), "prior_std": "small"}, "prior_std is not an array of numbers"),
     ],
 )

@@ -63,5 +63,5 @@ def test_forked_map_ends_its_processes_when_closed():
 def test_check_processes_returns_the_number_of_cores():
     assert check_processes(None) == num_cores() >= 1
     assert check_processes(3) == 3
-    with pytest.raises(InputError, match="at least one process, not 0"):
+    with pytest.raises(InputError, match="the number of processes must be a whole number of at least 1, not 0"):
         check_processes(0)

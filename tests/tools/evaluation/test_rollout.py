@@ -60,8 +60,8 @@ class Model:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": -1}, "a seed is a whole number of at least 0, not -1"),
-        ({"seed": 1.5}, "a seed must be a whole number, not 1.5"),
+        ({"seed": -1}, "a seed must be a whole number of at least 0, not -1"),
+        ({"seed": 1.5}, "a seed must be a whole number of at least 0, not 1.5"),
         ({"act": 3}, "3 is no policy"),
         ({"act": lambda observation: 7}, "returned 7, and the actions of this environment are 0 to 1"),
         ({"act": lambda observation: "left"}, "returned 'left', and the actions"),

@@ -292,7 +292,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"orientation": "quaternion"}, "choose euler_zyx or rotation_vector"),
         ({"period": 50.0}, r"demonstrations of 1.2 s are shorter than 4 periods of 50 s: give as period"),
         ({"period": 0.35}, "shorter than 4 periods"),
-        ({"action_dims": [0, 0]}, r"action_dims are distinct indices of the outputs, from 0 to 2, not \[0, 0\]"),
+        ({"action_dims": [0, 0]}, r"action_dims names an output twice, \[0, 0\]"),
         ({"action_dims": [0.5]}, "action_dims"),
         ({"action_dims": [True, False, True]}, "action_dims"),
         ({"guidance": "residual", "action_scale": -1.0}, "action_scale .* must be positive"),

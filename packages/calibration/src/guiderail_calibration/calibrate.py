@@ -127,11 +127,8 @@ def calibrate(
     Raises:
         InputError: If an argument or a recording is invalid, or the run has no folder and `out` is None.
     """
-    draws, predicted = as_whole(draws, "the number of draws"), as_whole(predicted, "the number of predicted draws")
-    if draws < MIN_DRAWS:
-        raise InputError(f"a calibration needs at least {MIN_DRAWS} draws of the prior, not {draws}: give more --draws")
-    if predicted < 0:
-        raise InputError(f"the number of draws of a prediction is 0 or more, not {predicted}")
+    draws = as_whole(draws, "the number of draws of the prior", MIN_DRAWS)
+    predicted = as_whole(predicted, "the number of draws of a prediction", 0)
     processes = check_processes(processes)
     subject = find_subject(run, None, environment)
     config = subject.config

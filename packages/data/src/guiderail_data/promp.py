@@ -49,9 +49,8 @@ class ProMp:
         steps = len(demonstrations.times[0])
         if any(not np.array_equal(t, demonstrations.times[0]) for t in demonstrations.times):
             raise InputError("a ProMP needs demonstrations on one clock: use resampled()")
-        count = min(NUM_BASIS, max(steps // 4, 2)) if num_basis is None else as_whole(num_basis, "num_basis")
-        if not 2 <= count <= max(steps // 2, 2):
-            raise InputError(f"basis functions must be between 2 and half the number of steps, {steps // 2}: {count}")
+        count = min(NUM_BASIS, max(steps // 4, 2)) if num_basis is None else num_basis
+        count = as_whole(count, "num_basis", 2, max(steps // 2, 2))
         clock = demonstrations.times[0]
         features = _features((clock - clock[0]) / (clock[-1] - clock[0]), count)
         outputs = np.stack(demonstrations.outputs)

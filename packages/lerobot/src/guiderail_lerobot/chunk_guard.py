@@ -146,9 +146,8 @@ class ChunkGuard:
                 `num_executed` is not a whole number in its range.
         """
         result = self.limit(chunk, self._past, self._plan)
-        number = len(result.outputs) if num_executed is None else as_whole(num_executed, "num_executed")
-        if number not in range(len(result.outputs) + 1):
-            raise InputError(f"{brief(num_executed)} steps of a chunk of {len(result.outputs)} can't be executed")
+        length = len(result.outputs)
+        number = length if num_executed is None else as_whole(num_executed, "num_executed", 0, length)
         self._past = np.concatenate([self._past, result.outputs[:number]])[-3:]
         self._plan = result.outputs[min(number, len(result.outputs) - 1) :]
         return result

@@ -3,11 +3,12 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.policy_system import PolicyError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail_lerobot.base_policy import BasePolicy, chunk_samples, mean_and_variance
 
 
@@ -59,8 +60,8 @@ class ChunkReference(LeafSystem):
         period: float,
     ):
         super().__init__()
-        observation_size = as_count(observation_size, "observation_size")
-        horizon, replan_steps = as_count(horizon, "horizon", 0), as_count(replan_steps, "replan_steps")
+        observation_size = as_whole(observation_size, "observation_size", 1)
+        horizon, replan_steps = as_whole(horizon, "horizon", 0), as_whole(replan_steps, "replan_steps", 1)
         if not (np.isfinite(covariance_floor) and covariance_floor > 0):
             raise InputError(f"covariance_floor must be positive and finite, not {covariance_floor}")
         self._policy, self._reference, self._horizon = policy, reference, horizon

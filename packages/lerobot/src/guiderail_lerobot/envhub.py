@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail_lerobot.env_server import open_environment
 
@@ -58,8 +59,7 @@ def make_hub_env(
     Raises:
         InputError: If the task or an option is invalid, or `n_envs` is less than 1.
     """
-    if n_envs < 1:
-        raise InputError(f"n_envs must be at least 1, not {n_envs}")
+    as_whole(n_envs, "n_envs", 1)
     makers = [partial(_make_one, task, dict(options))] * n_envs
     mode = AutoresetMode.SAME_STEP  # LeRobot reads the success of an episode from `final_info`
     vector = (

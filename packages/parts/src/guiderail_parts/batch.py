@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import write_table
@@ -76,8 +77,7 @@ def create_tasks(
     Raises:
         InputError: If `processes` is less than 1, or the stored results are damaged.
     """
-    if processes < 1:
-        raise InputError(f"--processes is at least 1, not {processes}")
+    as_whole(processes, "--processes", 1)
     (out / "logs").mkdir(parents=True, exist_ok=True)
     results = _read_results(out / STORE)
     if retry:

@@ -162,9 +162,9 @@ def create_task(
     """
     plug, socket, out = _as_path(plug, "the plug"), _as_path(socket, "the socket"), _as_path(out, "--out")
     scenarios = [_as_path(file, "--scenario") for file in scenario]
-    hard_episodes = as_whole(hard_episodes, "--hard-episodes")
+    hard_episodes = as_whole(hard_episodes, "--hard-episodes", 0, MAX_EPISODES)
     check_new(out, "folder with --out, or remove it")
-    _check_arguments(turn, pitch, search_turn, shrink, force_limit, friction, scenarios, hard_episodes)
+    _check_arguments(turn, pitch, search_turn, shrink, force_limit, friction, scenarios)
     start = cpu_time()
     parts = read_parts(plug, socket, unit, plug_pose, axis, center)
     for part in parts:
@@ -254,7 +254,6 @@ def _check_arguments(
     force_limit: float,
     friction: float,
     scenario: Sequence[Path],
-    hard_episodes: int,
 ) -> None:
     """Refuse invalid arguments at once; later steps would refuse them only after minutes."""
     values = {"turn": turn, "pitch": pitch, "search-turn": search_turn, "shrink": shrink, "force-limit": force_limit}
@@ -277,8 +276,6 @@ def _check_arguments(
         raise InputError("--force-limit is from {:g} to {:g} N, not {:g}".format(*FORCE_LIMITS, force_limit))
     if not 0.0 <= shrink <= MAX_SHRINK:
         raise InputError(f"--shrink is from 0 to {1e3 * MAX_SHRINK:g} mm, not {1e3 * shrink:g}")
-    if not 0 <= hard_episodes <= MAX_EPISODES:
-        raise InputError(f"--hard-episodes is from 0 to {MAX_EPISODES}, not {hard_episodes}")
     from guiderail.diagrams.envs.options import validate_options
     from guiderail_parts.task_file import Piece, is_plain_path
 

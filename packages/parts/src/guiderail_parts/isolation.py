@@ -11,8 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from guiderail.models.common.arrays import is_whole
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.arrays import as_whole
 
 _WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the limit of CPU time, plus a constant [s]
 
@@ -35,9 +34,7 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
         IsolatedError: If the function raised, its result cannot be pickled, or its process aborted, was killed or
             exceeded a limit.
     """
-    if not is_whole(cpu_seconds, 1):
-        raise InputError(f"cpu_seconds must be a whole number of at least 1, not {brief(cpu_seconds)}")
-    cpu_seconds = int(cpu_seconds)
+    cpu_seconds = as_whole(cpu_seconds, "cpu_seconds", 1)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_run_child, args=(sender, function, arguments, cpu_seconds, max_bytes))

@@ -19,6 +19,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.station import Impedance
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
@@ -70,8 +71,7 @@ def certify_skill(
     Raises:
         InputError: If there is no such run or task, its guidance cannot be certified, or an argument is invalid.
     """
-    if attack < 0:
-        raise InputError(f"the number of steps of an attack is at least 0, not {attack}")
+    as_whole(attack, "the number of steps of an attack", 0)
     skill = _find_skill(subject, environment, start_within)
     signing_key = _read_key(key)
     if out is None:

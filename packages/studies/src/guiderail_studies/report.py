@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_whole
 from guiderail.tools.evaluation.metrics import (
     TOLERANCE,
     VIOLATION,
@@ -67,8 +67,7 @@ def write_report(paths: Sequence[Path], out: Path, *, episodes: int = 0) -> Path
     Raises:
         InputError: As `gather`, or if `episodes` is negative or `out` is not an HTML file that can be written.
     """
-    if episodes < 0:
-        raise InputError(f"the number of episodes of an evaluation must be 0 or more, not {episodes}")
+    as_whole(episodes, "the number of episodes of an evaluation", 0)
     check_page(out)
     data = gather(paths, episodes)
     write_atomically(out, render(data).encode())

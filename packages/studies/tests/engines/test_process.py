@@ -92,7 +92,7 @@ def test_engine_refuses_unsupported_arguments():
         make_engine("proces")
     with pytest.raises(InputError, match="--engine ray"):
         make_engine("process", address="auto")
-    with pytest.raises(InputError, match="at least one process, not 0"):
+    with pytest.raises(InputError, match="the number of processes must be a whole number of at least 1, not 0"):
         make_engine("process", 0)
 
 

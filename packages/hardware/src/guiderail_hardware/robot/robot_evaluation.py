@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.policy import Policy
@@ -68,8 +69,7 @@ def evaluate_on_robot(
         InputError: If `episodes` is less than 1, the policy cannot be executed, no robot answers, a check fails or is
             not confirmed, the arm does not reach the start or does not resume, or the rows exist already.
     """
-    if episodes < 1:
-        raise InputError(f"a number of episodes is at least one, not {episodes}")
+    as_whole(episodes, "the number of episodes", 1)
     config = configuration(run, task)
     make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
     own_policy = Policy.load(find_run(run)) if policy is None else None

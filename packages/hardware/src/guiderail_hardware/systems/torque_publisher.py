@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.systems.support.declarations import as_count, check_period, input_getter
+from guiderail.models.common.arrays import as_whole
+from guiderail.systems.support.declarations import check_period, input_getter
 
 
 class TorquePublisher(LeafSystem):
@@ -46,7 +47,7 @@ class TorquePublisher(LeafSystem):
         super().__init__()
         check_period(period)
         self._write, self._hold = write, hold
-        self._torque_port = self.DeclareVectorInputPort("torque", as_count(num_joints, "num_joints"))
+        self._torque_port = self.DeclareVectorInputPort("torque", as_whole(num_joints, "num_joints", 1))
         self._is_sending_port = self.DeclareVectorInputPort("is_sending", 1)
         self._is_holding_port = self.DeclareVectorInputPort("is_holding", 1)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)

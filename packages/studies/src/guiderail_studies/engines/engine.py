@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_callable
 
@@ -67,8 +68,8 @@ def make_engine(name: str = "process", processes: int | None = None, address: st
         InputError: If the name is unknown, an argument is out of range or not supported by the engine, or the entry of
             the name returns no `Engine`.
     """
-    if processes is not None and processes < 1:
-        raise InputError(f"a study needs at least one process, not {processes}")
+    if processes is not None:
+        as_whole(processes, "the number of processes", 1)
     engine = ENGINES.get(name)(processes=processes, address=address)
     if not isinstance(engine, Engine):
         raise InputError(f"the engine {name!r} must be an Engine, not {brief(engine)}: derive its class from Engine")
