@@ -103,7 +103,7 @@ def test_recordings_that_cannot_be_used_are_refused(recorded, tmp_path):
 
 
 def test_too_few_draws_are_refused(recorded):
-    with pytest.raises(InputError, match="at least 40 draws"):
+    with pytest.raises(InputError, match="the number of draws of the prior must be a whole number of at least 40"):
         calibrate(RUN, recorded / "recordings", draws=3, out=recorded / "few")
 
 
