@@ -422,7 +422,7 @@ def test_plug_pose_is_refused_when_not_six_numbers(pose, tmp_path):
     [
         ({"turn": "a"}, "--turn must be a number, not 'a'"),
         ({"shrink": None}, "--shrink must be a number, not None"),
-        ({"hard_episodes": 2.5}, "--hard-episodes must be a whole number, not 2.5"),
+        ({"hard_episodes": 2.5}, "--hard-episodes must be a whole number from 0 to 100, not 2.5"),
         ({"plug": 5}, "the plug must be the path of a file or folder, not 5"),
         ({"scenario": ["missing.dmd.yaml"]}, "there is no scenario missing.dmd.yaml"),
         ({"center": (0.0, 0.0)}, r"--center is 3 numbers, not \(0.0, 0.0\)"),
