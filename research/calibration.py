@@ -203,7 +203,9 @@ def predictions(
         row(f"{engine}: not explained by the model", 1.0 - table["explained"].mean(), number),
     ]
     if regained:
-        rows.append(row("fraction of the lost success that is regained, median", float(np.median(regained)), len(regained)))
+        rows.append(
+            row("fraction of the lost success that is regained, median", float(np.median(regained)), len(regained))
+        )
     return rows
 
 
@@ -212,7 +214,10 @@ def continue_training(given: Any, subject: Any, base: Any, recorded: Simulator, 
     task = subject.config.task
     if not continue_run(run, REMEDY):
         environments = variants(task, base, recorded.parameters, draws[-VARIANTS:])
-        settings = {"init_from": str(given.run), "symmetry": subject.config.learner.symmetry}
+        learner = subject.config.learner
+        settings = {
+            "init_from": str(given.run), "symmetry": learner.symmetry, "privileged_critic": learner.privileged_critic
+        }  # fmt: skip
         train(
             task, out=run, episodes=REMEDY, seed=subject.config.seed, settings=settings, variants=environments,
             pictures=False,
