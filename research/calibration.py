@@ -1,9 +1,11 @@
 """Study of `guiderail calibrate`: coverage of its intervals, its predictions, and robots outside of the model.
 
-    python -m research.calibration --run RUN --out DIR [--draws N] [--faulty N] [--robots N] [--mujoco N]
+    python -m research.calibration --run RUN --out DIR [--draws N] [--faulty N] [--robots N] [--mujoco N] [--remedied N]
 
 Robots are draws of the prior. Every draw is also a hidden robot: its posterior is fitted to the draws of the other
-folds. The simulations are stored in DIR, so that the same command resumes. The table is DIR/calibration.csv.
+folds. With `--remedied`, training of RUN, a run with a checkpoint, continues on draws of the posterior of robots in
+Drake on which the policy loses at least `LOSS`. The simulations are stored in DIR, so that the same command resumes.
+The table is DIR/calibration.csv, and DIR/robots.csv has a row for each robot whose success is predicted.
 """
 
 from __future__ import annotations
@@ -15,23 +17,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.episode import EnvCallback, Transition
 from guiderail.tools.evaluation.subject import find_subject
+from guiderail.tools.learning.train import train
 from guiderail.tools.tables import write_table
-from guiderail_calibration.calibrate import EPISODES_OF_PREDICTION, fit
+from guiderail_calibration.calibrate import EPISODES_OF_PREDICTION, VARIANTS, fit, variants
 from guiderail_calibration.inference import FALSE_ALARMS, Posterior
 from guiderail_calibration.parameters import select_parameters
 from guiderail_calibration.prediction import LEVEL, predict
 from guiderail_calibration.probe import probe_options, write_probe
 from guiderail_calibration.simulations import EPISODES, Simulated, Simulator, draw_prior, simulate_all
 from guiderail_calibration.summaries import summarize
+from research.stored import continue_run
 
 FOLDS = 3
 FAULTY_SEED, ROBOT_SEED, MUJOCO_SEED = 21, 31, 41
-MEASURED = 30  # measured episodes of a policy on a hidden robot
+MEASURED = 100  # measured episodes of a policy on a hidden robot
+PREDICTED = 30  # draws of the posterior for which the policy is simulated
+LOSS = 0.1  # smallest loss of success on a robot for which training continues
+REMEDY = 40  # episodes of training that continues
 TILT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.radians(4.0)])  # of a bent workpiece, as a pose
 SLIP_SPEED, SLIP_FORCE = 5e-3, 2.0  # speed of a workpiece in a slipping grasp [m/s], and force above which it slips [N]
 
@@ -74,7 +82,7 @@ def folds(prior: list[Simulated], num_steps: int) -> Iterator[tuple[np.ndarray, 
         yield np.flatnonzero(at == fold), fit(rest, num_steps, EPISODES)
 
 
-def row(quantity: str, value: float, number: int) -> dict[str, Any]:
+def row(quantity: str, value: Any, number: int) -> dict[str, Any]:
     """Return a row of the table: a quantity, its value, and the number of robots."""
     print(f"{quantity}: {value:.3g} (n = {number})", flush=True)
     return {"quantity": quantity, "value": round(float(value), 4), "n": number}
@@ -89,6 +97,7 @@ def main() -> None:
     parser.add_argument("--faulty", type=int, default=20, help="robots of each fault")
     parser.add_argument("--robots", type=int, default=0, help="robots in Drake whose success is predicted")
     parser.add_argument("--mujoco", type=int, default=0, help="robots in MuJoCo whose success is predicted")
+    parser.add_argument("--remedied", type=int, default=0, help="robots in Drake for which training continues")
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -154,25 +163,66 @@ def predictions(
         replace(policy, environment=own), folder / "measured", drawn, episodes=MEASURED, seed=seed + 1,
         processes=processes, label="measured",
     )  # fmt: skip
-    inside, close, alarms = [], [], []
+    nominal = simulate_all(
+        Simulator(subject.config.task, base, (), subject.make_policy, str(subject.digest)), given.out / "nominal",
+        np.zeros((1, 0)), episodes=MEASURED, seed=seed + 1, processes=1, label="nominal",
+    )  # fmt: skip
+    nominal_rate = float(nominal[0].success.mean())
+    robots_of_engine: list[dict[str, Any]] = []
+    regained: list[float] = []
     for index, (robot, truth) in enumerate(zip(robots, measured, strict=True)):
         observed = summarize(robot.episodes, num_steps)
-        alarms.append(not posterior.explains(observed)[0])
-        draws = posterior.sample(observed, 30)
+        draws = posterior.sample(observed, PREDICTED)
         simulated = simulate_all(
             policy, folder / f"predicted-{index:03d}", draws, episodes=EPISODES_OF_PREDICTION, seed=seed + 2 + index,
             processes=processes, label=f"predicted {index}",
         )  # fmt: skip
         predicted, rate = predict(simulated), float(truth.success.mean())
-        interval = f"{predicted.low:.2f} to {predicted.high:.2f}"
-        print(f"{engine} {index}: predicted {predicted.success:.2f}, {interval}, measured {rate:.2f}", flush=True)
-        inside.append(predicted.low <= rate <= predicted.high)
-        close.append(abs(predicted.success - rate) <= 0.07)
-    return [
-        row(f"{engine}: interval contains the measured success", np.mean(inside), number),
-        row(f"{engine}: prediction within 7 points of the measured success", np.mean(close), number),
-        row(f"{engine}: not explained by the model", np.mean(alarms), number),
+        about: dict[str, Any] = {
+            "engine": engine, "robot": index, "explained": posterior.explains(observed)[0], "measured": rate,
+            "predicted": round(predicted.success, 3), "low": round(predicted.low, 3), "high": round(predicted.high, 3),
+        }  # fmt: skip
+        if engine == "Drake" and nominal_rate - rate >= LOSS and len(regained) < given.remedied:
+            run = continue_training(given, subject, base, recorded, draws, folder / f"remedy-{index:03d}")
+            after = simulate_all(
+                replace(policy, environment=own, make_policy=find_subject(run, None).make_policy),
+                folder / f"after-{index:03d}", drawn[index][None], episodes=MEASURED, seed=seed + 1, processes=1,
+                label=f"after {index}",
+            )[0]  # fmt: skip
+            about["after"] = float(after.success.mean())
+            regained.append((float(after.success.mean()) - rate) / (nominal_rate - rate))
+        print(about, flush=True)
+        robots_of_engine.append(about)
+        write_table(given.out / f"robots_{engine.lower()}", robots_of_engine)
+    table = pd.DataFrame(robots_of_engine)
+    inside = table["measured"].between(table["low"], table["high"])
+    close = (table["predicted"] - table["measured"]).abs() <= 0.07
+    rows = [
+        row(f"{engine}: interval contains the measured success", inside.mean(), number),
+        row(f"{engine}: prediction within 7 points of the measured success", close.mean(), number),
+        row(f"{engine}: not explained by the model", 1.0 - table["explained"].mean(), number),
     ]
+    if regained:
+        rows.append(
+            row("fraction of the lost success that is regained, median", float(np.median(regained)), len(regained))
+        )
+    return rows
+
+
+def continue_training(given: Any, subject: Any, base: Any, recorded: Simulator, draws: np.ndarray, run: Path) -> Path:
+    """Continue the training on draws (n, d) of a robot's posterior, or the interrupted run; return its folder."""
+    task = subject.config.task
+    if not continue_run(run, REMEDY):
+        environments = variants(task, base, recorded.parameters, draws[-VARIANTS:])
+        learner = subject.config.learner
+        settings = {
+            "init_from": str(given.run), "symmetry": learner.symmetry, "privileged_critic": learner.privileged_critic
+        }  # fmt: skip
+        train(
+            task, out=run, episodes=REMEDY, seed=subject.config.seed, settings=settings, variants=environments,
+            pictures=False,
+        )  # fmt: skip
+    return run
 
 
 if __name__ == "__main__":

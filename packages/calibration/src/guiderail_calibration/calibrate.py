@@ -39,7 +39,7 @@ DRAWS = 240  # default number of simulated draws of the prior
 MIN_DRAWS = 40
 SAMPLES = 2000  # draws of the posterior
 PREDICTED = 40  # default number of draws of the posterior for which the policy is simulated
-EPISODES_OF_PREDICTION = 2  # episodes of each of these draws
+EPISODES_OF_PREDICTION = 4  # episodes of each of these draws
 VARIANTS = 10  # number of variants of the environment
 
 

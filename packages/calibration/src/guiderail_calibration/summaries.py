@@ -32,19 +32,22 @@ def summarize_episode(episode: Episode, num_steps: int) -> np.ndarray:
     """Return the summaries of one episode.
 
     In each segment: mean tracking error and wrench, their norms in the plane and about its axes, drag and stiffness as
-    logarithms of ratios. In the whole episode: noise, correlations of the motion and of the wrench with the command at
-    several lags, first contact, largest force and length.
+    logarithms of ratios. Between segments: change of the measured height, which a workpiece at rest on a rim does not
+    change, unless it slips in the grasp. In the whole episode: noise, correlations of the motion and of the wrench with
+    the command at several lags, first contact, largest force and length.
     """
     desired, pose, wrench = (np.asarray(a, float) for a in (episode.desired, episode.pose, episode.wrench))
     error = (desired - pose) / POSE_SCALE
     force = wrench / WRENCH_SCALE
     edges = np.linspace(0, num_steps, SEGMENTS + 1).round().astype(int)
     values: list[np.ndarray] = []
+    heights = []
     for start, end in pairwise(edges):
         # A segment after the end of an episode repeats its last control steps.
         at = (
             slice(start, end) if start < len(desired) - 1 else slice(max(len(desired) - (end - start), 0), len(desired))
         )
+        heights.append(pose[at, 2].mean() / POSE_SCALE[2])
         e, f = error[at].mean(axis=0), force[at].mean(axis=0)
         plane_error, plane_force = (np.linalg.norm(v[at, :2], axis=1).mean() for v in (error, force))
         drag = np.log((plane_force + 1.0) / (abs(f[2]) + 1.0))
@@ -59,7 +62,7 @@ def summarize_episode(episode: Episode, num_steps: int) -> np.ndarray:
     first = float(np.argmax(contact)) if contact.any() else float(num_steps)
     largest = np.log(np.abs(force).max(axis=0) + 1.0)
     whole = np.array([first / num_steps, contact.mean(), len(desired) / num_steps, still])
-    return np.concatenate([*values, *noise, *lags, largest, whole])
+    return np.concatenate([*values, _compress(np.diff(heights)), *noise, *lags, largest, whole])
 
 
 def _compress(values: np.ndarray) -> np.ndarray:
