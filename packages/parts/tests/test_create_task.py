@@ -17,7 +17,7 @@ from guiderail.diagrams.tasks.insertion import CENTER_OF_PRESSURE_SCALE, Inserti
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as common_files
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives import Demonstrations, mixture
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.baselines import find_scripted_policy
@@ -71,6 +71,7 @@ def folder(tmp_path_factory):
     plug, socket = PARTS["square_peg"]().write(parent)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact, "MIN_SPEED", 0.0)
+        patch.setattr(mixture, "_MAX_COMPONENTS", 8)  # the fit of up to 20 takes half of the time
         call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
     yield parent / "peg"
     # The task must not be registered in other tests.
@@ -340,7 +341,7 @@ def test_scripted_search_follows_the_plug_below_the_rim(folder):
 
 @contextmanager
 def few_demonstrations(number=3):
-    """Record few demonstrations instead of ten, touch 4 times for the contact map, and try one setting of a contact."""
+    """Record few demonstrations instead of ten, fit few components, touch 4 times for the map, try one contact."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact, "MAX_TRIALS", 1)
         patch.setattr(contact, "MIN_SPEED", 0.0)  # no other contact is tried on a slow machine
@@ -348,6 +349,7 @@ def few_demonstrations(number=3):
         patch.setattr(demonstrator, "NUM_DEMONSTRATIONS", number)
         patch.setattr(create_task_module, "NUM_DEMONSTRATIONS", number)
         patch.setattr(contact_map, "TOUCHES", 4)
+        patch.setattr(mixture, "_MAX_COMPONENTS", 4)
         yield
 
 
