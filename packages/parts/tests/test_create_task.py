@@ -71,7 +71,6 @@ def folder(tmp_path_factory):
     plug, socket = PARTS["square_peg"]().write(parent)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact, "MIN_SPEED", 0.0)
-        patch.setattr(mixture, "_MAX_COMPONENTS", 8)  # the fit of up to 20 takes half of the time
         call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
     yield parent / "peg"
     # The task must not be registered in other tests.
