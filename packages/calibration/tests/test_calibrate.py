@@ -83,6 +83,8 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     def refuse(*_):
         raise AssertionError("simulated again")
 
+    episodes = load_recordings(recorded / "one")  # on the page, in place of simulated ones
+    monkeypatch.setattr(Simulator, "simulate", lambda *_: (episodes, []))
     monkeypatch.setattr("guiderail_calibration.simulations._write", refuse)
     again = calibrate(RUN, recorded / "one", **arguments)
     assert again["parameters"] == result["parameters"]

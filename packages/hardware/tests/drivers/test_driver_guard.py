@@ -150,6 +150,13 @@ def test_guard_returns_the_heartbeats_of_the_driver():
     assert driver.guard.read_heartbeats() == (heartbeat,)
 
 
+def test_round_trip_is_measured_when_a_heartbeat_reports_the_command():
+    guard = DirectDriver().guard
+    guard.write(np.zeros(7), 1.0)
+    assert np.isnan(guard.measure_round_trip((Heartbeat(1, False),), 0.005))
+    assert guard.measure_round_trip((Heartbeat(2, False, command=1_000_000),), 0.015) == pytest.approx(0.015)
+
+
 @pytest.mark.parametrize(
     ("fail", "failures", "is_repeating"),
     [
