@@ -14,6 +14,7 @@ STATUS, COMMAND = "on_status", "on_command"
 INJECTIONS = [
     faults.message_loss(STATUS, 0.015),
     faults.message_loss(STATUS, 0.06),
+    faults.message_delay(STATUS, 0.03),
     faults.message_delay(STATUS, 0.05),
     faults.message_duplication(STATUS, 0.02),
     faults.message_swap(STATUS, 3),
@@ -29,6 +30,7 @@ INJECTIONS = [
     faults.controller_pause(0.015),
     faults.controller_pause(0.3),
     faults.controller_kill(0.06),
+    faults.robot_kill(0.05),
     faults.robot_kill(0.1),
     faults.monitor_kill(0.1),
 ]
