@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from guiderail.tools.evaluation.subject import has_constant_offset
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.tables import read_table
-from guiderail_studies.declaration import load_study
+from guiderail_studies.declaration import Study, load_study
 from guiderail_studies.job import Job
 from guiderail_studies.statistics import Scores, bootstrap_interval, interquartile_mean, probability_of_improvement
 from research.results.sections import BASELINES, SECTIONS, Row, Section
@@ -105,6 +106,12 @@ def replace_table(text: str, table: str) -> str:
     if not begin or not end:
         raise ValueError(f"the page has no place for the table: put {BEGIN!r} and {END!r} there")
     return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
+
+
+@cache
+def _study(name: str) -> Study:
+    """Return a study of the research; reading it takes longer than everything else that a row needs."""
+    return load_study(study_path(name))
 
 
 def last_rows(tables: Path, row: Row) -> pd.DataFrame:
@@ -232,7 +239,7 @@ def improvements(section: Section, tables: Path) -> list[str]:
 
 def is_guided(row: Row) -> bool:
     """Return True for a method of the thesis, and False for a method that is compared with it."""
-    study = load_study(study_path(row.study))
+    study = _study(row.study)
     environment = {**study.env, **study.methods[row.method].env}
     return environment.get("guidance", GUIDED[0]) in GUIDED
 
@@ -269,7 +276,7 @@ def demonstrated_episodes(row: Row) -> int:
 
     The imports of the study are executed only if the default of the method's learner is needed.
     """
-    study = load_study(study_path(row.study))
+    study = _study(row.study)
     choices = [study.learner, study.methods[row.method].learner]
     # As in `Job.config`: the value null of a method overrides the study's choice.
     names = ("algorithm", "preset")
@@ -284,7 +291,7 @@ def demonstrated_episodes(row: Row) -> int:
 
 def has_run_offset(row: Row) -> bool:
     """Return True if all held-out episodes of a seed have the hidden offset of its training."""
-    study = load_study(study_path(row.study))
+    study = _study(row.study)
     import_modules(study.imports)
     environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment
     return any(

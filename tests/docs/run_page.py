@@ -8,6 +8,7 @@ The page runs in an empty folder. A failure ends the program with the block and 
 
 import contextlib
 import doctest
+import functools
 import io
 import multiprocessing
 import os
@@ -106,18 +107,23 @@ def run(page: Path, shell: Shell | None) -> None:
 
 
 def shorten_pictures() -> None:
-    """Omit the layout of labels and show one episode on a training's page, which saves time in tests."""
+    """Omit the layout of labels, show one episode on a training's page, and draw no pictures of a resumed training."""
+    from guiderail.tools.learning import train
     from guiderail.tools.visualization import figures, replay
 
     figures.LAYOUT, replay.EPISODES = None, 1
+    train.draw_pictures = functools.cache(train.draw_pictures)
 
 
 def shorten_create_task() -> None:
-    """Measure a contact map, which no page shows, in 4 touches instead of 60, and try no contact for its speed."""
+    """Shorten what no page shows: contact map, size of the mixture, episodes of the calibration, speed of a contact."""
     with contextlib.suppress(ImportError):  # guiderail-parts is missing
-        from guiderail_parts import contact, contact_map
+        from guiderail.models.primitives import mixture
+        from guiderail_parts import contact, contact_map, difficulty
 
         contact_map.TOUCHES, contact.MIN_SPEED = 4, 0.0
+        mixture._MAX_COMPONENTS = 4
+        difficulty.score_setting = lambda *_: difficulty.Score(0, 1, 1, 1)
 
 
 def main(page: Path) -> None:

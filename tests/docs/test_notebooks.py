@@ -1,6 +1,7 @@
 """Notebooks in `examples/notebooks`: the cells run in order, and no output is stored."""
 
 import json
+import re
 import shutil
 import sys
 import tomllib
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 from fork_server import Forks
 
-SHORTEN_PICTURES = "import run_page; run_page.shorten_pictures()"  # imports guiderail
+SHORTEN_PICTURES = "import run_page; run_page.shorten_pictures()"  # imports modules of guiderail
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
 
 
@@ -35,8 +36,10 @@ def forks():
 def test_notebook_runs_without_modules_of_the_tests(notebook, forks, tmp_path):
     program = tmp_path / "cells.py"
     shutil.copy(Path(__file__).with_name("run_page.py"), tmp_path)  # the program imports it from its own folder
-    first, *cells = filter(None, (code_of(cell) for cell in code_cells(notebook)))
-    program.write_text("\n".join([first, SHORTEN_PICTURES, *cells]))
+    code = "\n".join(code_of(cell) for cell in code_cells(notebook))
+    code, count = re.subn(r"^(import|from) guiderail\b.*$", rf"\g<0>\n{SHORTEN_PICTURES}", code, count=1, flags=re.M)
+    assert count == 1
+    program.write_text(code)
     finished = forks.run(program, folder=tmp_path, MPLBACKEND="agg", OMP_NUM_THREADS="1")
     assert finished.returncode == 0, finished.stderr
 

@@ -9,14 +9,19 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILES = sorted(EXAMPLES.glob("*.py"))
 MAX_LINES = 60
+SHORTER = {"SAMPLES, EXECUTED = 8, 10, 4": "SAMPLES, EXECUTED = 4, 2, 4"}  # a tenth of the simulations of a plan
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
 def test_example_is_short_and_runs_in_another_folder(file, forks, tmp_path):
-    finished = forks.run(file, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat", OMP_NUM_THREADS="1")
+    text, program = file.read_text(), tmp_path / file.name
+    for long, short in SHORTER.items():
+        text = text.replace(long, short)
+    program.write_text(text)
+    finished = forks.run(program, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat", OMP_NUM_THREADS="1")
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.strip()
-    assert len(file.read_text().splitlines()) <= MAX_LINES
+    assert len(text.splitlines()) <= MAX_LINES
 
 
 def test_examples_pass_mypy_without_path_settings(tmp_path):

@@ -16,9 +16,9 @@ START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 
 @cache
 def model_at_start():
-    """Return the model of the arm, and its joint positions at `START`, which take most of the construction."""
+    """Return the model of the arm, its joint positions at `START`, and a context, which take most of the time."""
     model = ArmControllerPlant(BncWorkcell())
-    return model, model.solve(START, model.posture)
+    return model, model.solve(START, model.posture), model.plant.CreateDefaultContext()
 
 
 class DirectDriver(Driver):
@@ -30,7 +30,7 @@ class DirectDriver(Driver):
 
     def __init__(self, url=""):
         super().__init__(url)
-        self.model, positions = model_at_start()
+        self.model, positions, self._context = model_at_start()
         self.positions = positions.copy()
         self.velocities, self.time, self.torques = np.zeros(7), 0.0, []
 
@@ -39,9 +39,8 @@ class DirectDriver(Driver):
 
     def write(self, torque, time):
         plant = self.model.plant
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, self.positions)
-        M = plant.CalcMassMatrix(context)
+        plant.SetPositions(self._context, self.positions)
+        M = plant.CalcMassMatrix(self._context)
         self.velocities = self.velocities + self.period * np.linalg.solve(M, torque)
         self.torques.append(torque)
 

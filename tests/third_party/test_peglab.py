@@ -63,7 +63,7 @@ def run_folder(lab):
     """Return the folder of a run that is trained for three episodes."""
     guiderail(
         lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "3",
-        "--env", "width=0.16", "--out", "run",
+        "--env", "width=0.16", "--out", "run", "--no-pictures",
     )  # fmt: skip
     return lab.folder / "run"
 
@@ -104,7 +104,7 @@ def test_train_refuses_an_invalid_option_with_one_sentence(lab):
 
 def test_run_is_resumed_and_evaluated(lab, run_folder):
     guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run", "--no-pictures")
-    result = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
+    result = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--baselines", "zero", "--json"))
     assert result["episodes"] == 2
     assert result["max_commanded_violation"] <= 1e-9
 
@@ -171,13 +171,13 @@ def test_study_of_the_task_writes_its_results(lab):
         """
 name: slot
 task: peglab/Slot
-learner: {algorithm: peglab_hill_climbing, episodes: 3}
+learner: {algorithm: peglab_hill_climbing, episodes: 1}
 methods:
   kgrl: {env: {guidance: kgrl}}
   zero: {env: {guidance: kgrl}, policy: zero}
 seeds: [1]
 eval_set:
-  - {name: held_out, episodes: 3}
+  - {name: held_out, episodes: 1}
 """
     )
     guiderail(lab, "study", "study.yaml", "--processes", "1", "--out", "study", "--json")
@@ -203,9 +203,9 @@ def test_task_in_a_file_works_without_installation(lab):
         "@register_task('local/Passage')\nclass LocalPassage(NarrowPassage):\n    duration = 0.8\n"
     )
     guiderail(
-        lab, "train", "local/Passage", "--import", "local_task.py", "--episodes", "2", "--guidance", "kgrl",
+        lab, "train", "local/Passage", "--import", "local_task.py", "--episodes", "1", "--guidance", "kgrl",
         "--algorithm", "peglab_hill_climbing", "--out", "local", "--no-pictures",
     )  # fmt: skip
     # The run stores the name of the file, and `--trust-imports` permits its import.
-    command = ("evaluate", "local", "--episodes", "2", "--trust-imports", "--baselines", "none", "--json")
-    assert json.loads(guiderail(lab, *command))["episodes"] == 2
+    command = ("evaluate", "local", "--episodes", "1", "--trust-imports", "--baselines", "none", "--json")
+    assert json.loads(guiderail(lab, *command))["episodes"] == 1

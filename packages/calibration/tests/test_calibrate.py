@@ -48,27 +48,29 @@ def test_summaries_tell_robots_apart_more_than_episodes(recorded):
 
 
 def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
-    # One recorded episode, and few draws of one episode each: more are for coverage, which is not tested here.
+    # One recorded episode, few draws of one episode each, and one flow: more are for coverage, not tested here.
     first = min((recorded / "recordings").glob("*.parquet"))
     (recorded / "one").mkdir()
     shutil.copy(first, recorded / "one")
     monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", 1)
-    monkeypatch.setattr("guiderail_calibration.calibrate.MIN_DRAWS", 20)
+    monkeypatch.setattr("guiderail_calibration.calibrate.MIN_DRAWS", 12)
+    monkeypatch.setattr("guiderail_calibration.calibrate.EPISODES_OF_PREDICTION", 1)
+    monkeypatch.setattr("guiderail_calibration.inference.MEMBERS", 1)
     sentences = []
     arguments = {
-        "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 20,
+        "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 12,
         "predicted": 1, "out": recorded / "out", "processes": 1, "log": sentences.append,
     }  # fmt: skip
     result = calibrate(RUN, recorded / "one", **arguments)
     (row,) = result["parameters"]
     assert row["identifiable"] == "yes"
-    # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 20 draws.
+    # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 12 draws.
     assert row["low"] > 1.0  # the robot is stiffer than the nominal one
     assert np.sqrt(row["low"] * row["high"]) == pytest.approx(1.7, rel=0.2)
     assert row["high"] / row["low"] < 0.5 * row["prior_high"] / row["prior_low"]
     assert sentences
     assert sentences[0].startswith("stiffness: the summaries explain")
-    assert result["prediction"]["episodes"] == 2
+    assert result["prediction"]["episodes"] == 1
     stored = load_variants(result["variants"])
     assert len(stored) == 10
     assert all(0.5 <= variant["disturbances.stiffness_factor"] <= 2.0 for variant in stored.values())
@@ -81,6 +83,8 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     def refuse(*_):
         raise AssertionError("simulated again")
 
+    episodes = load_recordings(recorded / "one")  # on the page, in place of simulated ones
+    monkeypatch.setattr(Simulator, "simulate", lambda *_: (episodes, []))
     monkeypatch.setattr("guiderail_calibration.simulations._write", refuse)
     again = calibrate(RUN, recorded / "one", **arguments)
     assert again["parameters"] == result["parameters"]

@@ -87,7 +87,7 @@ static int test_limits(const Data& data, const double* start) {
     std::copy_n(measured.pose, 7, last);
     const Tensor &K = data.get("governor/stiffness"), &bound = data.get("governor/bound");
     const long before = allocations;
-    for (int i = 0; i < 4000; ++i) {
+    for (int i = 0; i < 2000; ++i) {
       const double* target = runner.update(kPeriod, measured.pose, measured.wrench, 0.0);
       if (!bounds_force) CHECK(distance(target, last) <= settings.max_speed * kPeriod + 1e-9);
       if (bounds_force)
@@ -187,7 +187,7 @@ static int test_garbage(const Data& data, const double* start) {
   CHECK(runner.start(good.pose));
   skill.start(start);
   const long before = allocations;
-  for (int i = 0; i < 20000; ++i) {
+  for (int i = 0; i < 6000; ++i) {
     Measured measured = good;
     double pose[6], period = kPeriod, age = 0.0;
     std::copy_n(start, 6, pose);

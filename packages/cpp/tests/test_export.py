@@ -18,6 +18,7 @@ from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail_cpp.arrays import primitive_arrays
 from guiderail_cpp.project import export_cpp
+from guiderail_cpp.recording import record_skill
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
 HERE = Path(__file__).parent
@@ -30,12 +31,14 @@ SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Return a function that exports a pretrained skill once and returns its folder."""
+    """Return a function that exports a pretrained skill once, with two recorded episodes, and returns its folder."""
     root = tmp_path_factory.mktemp("skills")
 
     @functools.cache
     def export(name):
-        export_cpp(f"pretrained:{name}", root / name)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(record_skill, "__defaults__", (2, 0))
+            export_cpp(f"pretrained:{name}", root / name)
         return root / name
 
     return export

@@ -20,7 +20,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.onnx import export_onnx, policy_to_onnx
-from guiderail_cpp.recording import COMPUTED
+from guiderail_cpp.recording import COMPUTED, record_skill
 
 
 @settings(deadline=None, max_examples=40)
@@ -52,7 +52,9 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
 def exported(request, tmp_path_factory):
     """Return the name of a pretrained policy, the folder of its export, and the exported loop as a module."""
     folder = tmp_path_factory.mktemp("export") / request.param
-    export_onnx(f"pretrained:{request.param}", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_skill, "__defaults__", (2, 0))  # two recorded episodes
+        export_onnx(f"pretrained:{request.param}", folder)
     spec = importlib.util.spec_from_file_location("exported_loop", folder / "loop.py")
     loop = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(loop)

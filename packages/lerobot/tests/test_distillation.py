@@ -16,7 +16,7 @@ from guiderail_lerobot.config import DistillationConfig
 from guiderail_lerobot.distillation import DistillationLearner
 
 OPTIONS = {"guidance": "kgrl", "action_repeat": 10}
-SETTINGS = {"chunk_steps": 10, "gradient_steps": 1500, "net_arch": (32,), "batch_size": 64, "learning_rate": 5e-3}
+SETTINGS = {"chunk_steps": 10, "gradient_steps": 1000, "net_arch": (32,), "batch_size": 64, "learning_rate": 5e-3}
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import mixture
 from guiderail.tools.cli.main import main
 from guiderail_parts import batch, contact, contact_map
 from guiderail_parts.batch import create_tasks, create_with_shrink
@@ -23,6 +24,7 @@ def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys, monke
     monkeypatch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])  # three demonstrations
     monkeypatch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
     monkeypatch.setattr(contact_map, "TOUCHES", 4)
+    monkeypatch.setattr(mixture, "_MAX_COMPONENTS", 4)
     monkeypatch.setattr(contact, "MAX_TRIALS", 1)
     monkeypatch.setattr(contact, "MIN_SPEED", 0.0)  # no further trials on a slow machine
     meshes, out = tmp_path / "meshes", tmp_path / "parts"

@@ -17,7 +17,7 @@ from guiderail.diagrams.tasks.insertion import CENTER_OF_PRESSURE_SCALE, Inserti
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as common_files
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives import Demonstrations, mixture
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
 from guiderail.tools.evaluation.baselines import find_scripted_policy
@@ -340,7 +340,7 @@ def test_scripted_search_follows_the_plug_below_the_rim(folder):
 
 @contextmanager
 def few_demonstrations(number=3):
-    """Record few demonstrations instead of ten, touch 4 times for the contact map, and try one setting of a contact."""
+    """Record few demonstrations instead of ten, fit few components, touch 4 times for the map, try one contact."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact, "MAX_TRIALS", 1)
         patch.setattr(contact, "MIN_SPEED", 0.0)  # no other contact is tried on a slow machine
@@ -348,6 +348,7 @@ def few_demonstrations(number=3):
         patch.setattr(demonstrator, "NUM_DEMONSTRATIONS", number)
         patch.setattr(create_task_module, "NUM_DEMONSTRATIONS", number)
         patch.setattr(contact_map, "TOUCHES", 4)
+        patch.setattr(mixture, "_MAX_COMPONENTS", 4)
         yield
 
 
@@ -391,12 +392,13 @@ def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
     np.testing.assert_array_equal(search(observation), np.zeros(3))  # a new episode
 
 
-def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
+def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys, monkeypatch):
     part = screw()
     arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
+    monkeypatch.setattr(trial, "MAX_SESSIONS", 1)  # a single attempt at each demonstration, of which one seats the plug
     with few_demonstrations(2):
         call("create-task", *arguments, *part.options)
-    assert "2 of 2" in capsys.readouterr().out
+    assert "1 of 2" in capsys.readouterr().out
     file = read_task_file(tmp_path / "screw")
     assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
     assert file.measured["inserted"]

@@ -65,8 +65,9 @@ def test_period_is_accepted_when_a_multiple_of_the_plants():
     assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).diagram.control_period == 3 * PLANT_PERIOD
 
 
-@pytest.mark.parametrize("milliseconds", [0.5, 1.0, 2.0, 2.5, 4.0, 20 / 3])
-@pytest.mark.parametrize("station", ["gantry", "arm"])
+@pytest.mark.parametrize(
+    ("station", "milliseconds"), [*(("gantry", step) for step in (0.5, 2.0, 2.5, 4.0, 20 / 3)), ("arm", 20 / 3)]
+)
 def test_plant_has_equal_numbers_of_steps_in_all_control_periods(station, milliseconds):
     env = make_env("GridClamp", guidance="sct", station=station, time_step=1e-3 * milliseconds, action_repeat=1)
     env.reset(seed=0)
@@ -79,7 +80,7 @@ def test_plant_has_equal_numbers_of_steps_in_all_control_periods(station, millis
     assert times == [index * inner.plant.time_step() for index in range(1, 7 * count + 1)]
 
 
-@pytest.mark.parametrize(("control_period", "time_step"), [(0.1, 0.001), (0.03, 0.003), (0.05, 0.002)])
+@pytest.mark.parametrize(("control_period", "time_step"), [(0.03, 0.003), (0.05, 0.002)])
 def test_control_period_is_a_multiple_of_any_time_step(control_period, time_step):
     env = make_env("BncConnector", guidance="kgrl", control_period=control_period, time_step=time_step)
     env.reset(seed=0)

@@ -32,10 +32,10 @@ def free_motion(env, steps=45, seed=3):
 def test_setting_is_tared_and_seeded_on_every_station(station, sensing):
     env = make_env("BncConnector", station=station, sensing=sensing, **HARD)
     measured, exact, info = free_motion(env)
-    repeated, _, repeated_info = free_motion(env)
-    np.testing.assert_array_equal(repeated, measured)
-    other_seed, _, other_info = free_motion(env, seed=4)
-    assert not np.array_equal(other_seed, measured)
+    repeated, _, repeated_info = free_motion(env, steps=20)
+    np.testing.assert_array_equal(repeated, measured[:20])
+    other_seed, _, other_info = free_motion(env, steps=20, seed=4)
+    assert not np.array_equal(other_seed, measured[:20])
     delay = info["wrench_delay"]
     assert SENSING[sensing].wrench_delay[0] <= delay <= SENSING[sensing].wrench_delay[1]
     assert np.array_equal(repeated_info["calibration_error"], info["calibration_error"])

@@ -69,9 +69,8 @@ def test_spaces_have_the_documented_shapes(skgrl):
     assert observation[0] == -1.0
 
 
-@pytest.mark.parametrize("offset", [(0.3, 0.0), (-0.2, -0.2)])
-def test_demonstration_locks_when_the_offset_is_small(kmp, offset):
-    info, total, _ = play(kmp, zero_policy(kmp), seed=0, options={"offset": np.array(offset) * MM})
+def test_demonstration_locks_when_the_offset_is_small(kmp):
+    info, total, _ = play(kmp, zero_policy(kmp), seed=0, options={"offset": np.array([-0.2, -0.2]) * MM})
     assert info["termination"] == "success"
     assert info["control_steps"] < NUM_STEPS
     assert total > 50.0

@@ -43,10 +43,10 @@ def test_spaces_are_those_of_velocity_without_guidance():
     assert env.observation_space.shape == (6,)
 
 
-# Starts [m] at four corners of their range: azimuth [°], radius and height [m].
+# Starts [m] at opposite corners of their range: azimuth [°], radius and height [m].
 STARTS = [
     (radius * np.cos(np.deg2rad(azimuth)), radius * np.sin(np.deg2rad(azimuth)), height)
-    for azimuth, radius, height in [(-120, 0.24, 0.08), (-120, 0.30, 0.19), (-75, 0.24, 0.19), (-75, 0.30, 0.08)]
+    for azimuth, radius, height in [(-120, 0.30, 0.19), (-75, 0.24, 0.08)]
 ]
 
 
@@ -57,7 +57,7 @@ def test_scripted_policy_pours_only_with_the_constraints(env, unconstrained, sta
     assert total > 200.0
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert env.trace.statistics()["collisions"] == 0.0
-    # Without constraints: the scripted policy for two starts, its recorded actions for the others.
+    # Without constraints: the recorded actions for the first start, the scripted policy for the second.
     recorded = iter([*actions, *[actions[-1]] * 150])
     policy = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(recorded)
     info, _, _ = run(unconstrained, policy, seed=1, options={"start": start})
@@ -76,7 +76,7 @@ def test_adversary_neither_collides_nor_violates_constraints(env, adversary):
         tilts.append((state, np.hypot(turn[0], turn[1])))
         violations.append(info["constraint_violation"])
 
-    info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), max_actions=35, on_step=on_step)
+    info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), max_actions=20, on_step=on_step)
     assert info["termination"] not in ("collision", "spill")
     assert max(violations) <= 1e-9
     # The thermos is upright in state 0, up to the tracking error of the arm.
@@ -93,11 +93,10 @@ def test_velocity_ends_in_a_collision_without_guidance():
 def test_active_constraints_filter_a_velocity():
     env = make_env("Pouring", guidance="none", reward="sparse", active_constraints=True)
     rng = np.random.default_rng(0)
-    for seed in range(2):
-        corner = np.sign(rng.normal(size=6))
-        info, _, _ = run(env, lambda observation, corner=corner: corner, seed=seed, max_actions=30)
-        assert info["termination"] not in ("collision", "spill")
-        assert info["constraint_violation"] <= 1e-9
+    corner = np.sign(rng.normal(size=6))
+    info, _, _ = run(env, lambda observation: corner, seed=0, max_actions=30)
+    assert info["termination"] not in ("collision", "spill")
+    assert info["constraint_violation"] <= 1e-9
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,9 @@ def test_policy_without_a_run_needs_a_task(policy):
 
 
 def test_result_without_a_run_states_guidance_and_observation(policy):
-    scope = evaluate(policy, "BncConnector", 1, baselines=(), processes=1)["evaluation_scope"]
+    short = {"bounded_force": False, "force_limit": 5.0}  # the episode ends at the first contact
+    result = evaluate(policy, "BncConnector", 1, baselines=(), processes=1, environment=short)
+    scope = result["evaluation_scope"]
     assert scope.endswith(", guidance=kgrl, difficulty=standard, observation=mean_contact_point, action_repeat=10")
 
 

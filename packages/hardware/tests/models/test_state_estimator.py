@@ -1,5 +1,6 @@
 """Estimator of the joint state, tested with statuses of a simulated robot of two joints, some of them falsified."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ DAMPING = np.array([0.25, 0.5])
 EXTERNAL = np.array([0.5, 0.25])
 CRUISE = np.array([0.4, 0.2])
 SETTLED = round(LIMITS.settling_time / PERIOD) + 3  # number of checks until the initial fault has ended
+SETTLED_RIGS = {}
 
 
 class Rig:
@@ -56,9 +58,14 @@ class Rig:
         return self.estimate.fault
 
     def settle(self):
-        for _ in range(SETTLED):
-            self.torque = self.balance  # before the first command as well
-            self.check()
+        """Check statuses until the initial fault has ended; equal rigs settle once and are copied."""
+        key = repr((self.v.tolist(), self.external.tolist(), self.estimator._limits))
+        if key not in SETTLED_RIGS:
+            for _ in range(SETTLED):
+                self.torque = self.balance  # before the first command as well
+                self.check()
+            SETTLED_RIGS[key] = deepcopy(vars(self))
+        vars(self).update(deepcopy(SETTLED_RIGS[key]))
         assert self.estimate.fault == Fault.NONE
         assert self.estimate.is_new
         return self

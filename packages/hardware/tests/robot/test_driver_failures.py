@@ -14,14 +14,15 @@ def scalar_status():
     return JointStatus(1.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("step", [120, 210])  # during the approach, and during the skill
 @pytest.mark.parametrize(
-    ("method", "replacement", "fault", "reason"),
-    [
-        ("read", unplugged, Fault.MALFORMED, "read raised OSError: cable unplugged"),
-        ("receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
-        ("read", scalar_status, Fault.WRONG_SIZE, "wrong number of joints"),
-        ("read", lambda: None, Fault.NO_STATUS, "no status message"),
+    ("step", "method", "replacement", "fault", "reason"),
+    [  # in step 120 during the approach, in step 210 during the skill
+        (120, "read", unplugged, Fault.MALFORMED, "read raised OSError: cable unplugged"),
+        (120, "receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
+        (210, "receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
+        (210, "read", scalar_status, Fault.WRONG_SIZE, "wrong number of joints"),
+        (120, "read", lambda: None, Fault.NO_STATUS, "no status message"),
+        (210, "read", lambda: None, Fault.NO_STATUS, "no status message"),
     ],
 )
 def test_arm_rests_when_the_driver_fails(make_executor, step, method, replacement, fault, reason):
