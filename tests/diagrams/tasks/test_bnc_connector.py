@@ -158,7 +158,7 @@ def test_single_demonstration_requires_prior_std(tmp_path):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=1)
     with pytest.raises(InputError, match="there are 5, which have"):
         make_env("BncConnector", guidance="kgrl", prior_std=PRIOR_STD)
-    with pytest.raises(InputError, match="all 5 demonstrations, not 6"):
+    with pytest.raises(InputError, match="from 1 to 5, not 6"):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=6)
     with pytest.raises(InputError, match="give meters and radians"):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=(1.7, *PRIOR_STD[1:]))

@@ -123,7 +123,7 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
         evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero")
-    with pytest.raises(InputError, match="at least one"):
+    with pytest.raises(InputError, match="at least 1"):
         evaluate_on_robot(tmp_path, RobotConnection(), 0)
     # An evaluation that has no row yet does not overwrite the file of a simultaneous evaluation.
     out = tmp_path / "out"
