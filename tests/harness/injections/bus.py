@@ -137,13 +137,6 @@ class Bus:
         self.robot_time, self.has_robot = 0, True
         self._relay_statuses()
 
-    def start_over(self) -> None:
-        """Restart all programs with the robot at its initial pose."""
-        self.step = 0
-        self.start_robot()
-        self.start_monitor()
-        self.start_controller()
-
     def start_monitor(self) -> None:
         """Start the safety monitor without any earlier state."""
         plant, clock = self.robot.controller_plant.plant, lambda: self.step * PERIOD + self.monitor_clock_error

@@ -54,8 +54,9 @@ def test_injection_reports_a_missed_or_needless_stop(bus):
     assert replace(stopping, stops=False).inject(bus).failures == ["stopped the arm: WRONG_SIZE"]
 
 
-def test_contact_with_a_rim_is_no_fault(bus, monkeypatch):
+def test_contact_with_a_rim_is_no_fault(monkeypatch):
     """The plug hits the rim beside the bore, and presses with the largest force of the impedance, 40 N."""
+    bus = Bus()
     begin, speed, depth = bus.step, 0.05, 0.04
     beside = np.array([0.003, 0.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -64,8 +65,6 @@ def test_contact_with_a_rim_is_no_fault(bus, monkeypatch):
         down = np.clip(speed * (elapsed - 1.2), 0.0, depth)
         return START + min(elapsed, 1.0) * beside - [0.0, 0.0, down, 0.0, 0.0, 0.0]
 
-    bus.start_over()
-    begin = bus.step
     monkeypatch.setattr(bus, "desired", desired)
     bus.run_until_following(0.0)
     while (bus.step - begin) * PERIOD < 1.2 + depth / speed + 0.3:
