@@ -58,7 +58,7 @@ def test_run_resumes_bit_for_bit(trained, config, tmp_path):
 
 def test_evaluation_includes_the_demonstration_and_saves_the_episodes(trained, tmp_path):
     file = tmp_path / "saved.npz"
-    result = evaluate(trained.path, episodes=2, baselines=(), save=file)
+    result = evaluate(trained.path, episodes=2, baselines=("uniform_random",), save=file)
     assert result["demonstration_success_rate"] == 1.0
     assert result["max_commanded_violation"] <= 1e-9
     assert result["saved"] == 2

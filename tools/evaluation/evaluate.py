@@ -262,8 +262,9 @@ def evaluate(
             these is a set of environments, as is None for a run that was trained over a set.
         episodes: Number of held-out episodes; in a set, of each environment.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
-            None is the default set of the task. If the guidance of a task has a demonstration, the demonstration alone
-            is always evaluated; in an environment that is given as an object, it is the baseline policy "zero".
+            None is the default set of the task, and an empty set evaluates the policy alone. If the guidance of a task
+            has a demonstration, every other set includes the demonstration alone; in an environment that is given as an
+            object, it is the baseline policy "zero".
         environment: Options of the environment that differ from the run's options or the task's defaults.
         seed: Seed of the first episode; episode i has seed + i, on which the actions of random baselines depend too.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it: a policy
@@ -409,7 +410,8 @@ def _evaluate_subject(subject: Subject, env: Any, is_given: bool, options: _Opti
                 f"episode {config.seed - seed} of these has the offset of the run itself: give another --seed, such as "
                 f"{config.seed + 1}"
             )
-    makers = {"demonstration": zero_policy} if is_demonstrated(environment.get("guidance")) else {}
+    is_alone = baselines is not None and not baselines  # an empty set: the policy alone
+    makers = {"demonstration": zero_policy} if is_demonstrated(environment.get("guidance")) and not is_alone else {}
     makers |= make_baselines(config, environment, baselines)
     if POLICY in makers:
         raise InputError(f"a baseline policy cannot be called {POLICY!r}, which is the evaluated policy")

@@ -53,15 +53,21 @@ def test_load_or_compute_computes_once(tmp_path):
 
 
 def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
-    result = evaluate(bead_run, episodes=3, baselines=())
+    result = evaluate(bead_run, episodes=3, baselines=("uniform_random",))
     printed = capsys.readouterr().err
-    assert "series 1 of 2: policy 3/3" in printed
-    assert "series 2 of 2: demonstration alone 3/3" in printed
+    assert "series 1 of 3: policy 3/3" in printed
+    assert "series 2 of 3: demonstration alone 3/3" in printed
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
     blocked = evaluate(Run(bead_run), episodes=3, environment={"wall": -0.5})
     assert blocked["success_rate"] == blocked["demonstration_success_rate"] == 0.0
     assert blocked["mean_return"] != result["mean_return"]
+
+
+def test_empty_set_of_baselines_evaluates_the_policy_alone(bead_run, capsys):
+    result = evaluate(bead_run, episodes=2, baselines=())
+    assert "series 1 of 1: policy 2/2" in capsys.readouterr().err
+    assert result["demonstration_success_rate"] is None
 
 
 def test_stored_episodes_that_lost_rows_are_evaluated_again(bead_run):
