@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gymnasium import spaces
-from random_episodes import learn, make_learner
+from random_episodes import OBSERVATION, check_learning_resumes, learn, make_learner
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
@@ -13,25 +13,10 @@ from guiderail.tools.learning.learner import learner_arguments
 from guiderail.tools.learning.learner_config import make_config, resolve_preset
 
 SETTINGS = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
-OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
 
 
 def test_learner_acts_learns_and_resumes_bit_for_bit():
-    config = resolve_preset(None, "ppo", SETTINGS)
-    learner = make_learner(config)
-    before = learner.policy({"observation_shape": [3]})(OBSERVATION)
-    rng = np.random.default_rng(0)
-    learn(learner, 4, rng)
-    assert not np.array_equal(learner.policy({"observation_shape": [3]})(OBSERVATION), before)
-    arrays, values = learner.state()
-    arrays = {key: value.copy() for key, value in arrays.items()}
-    expected = learn(learner, 3, np.random.default_rng(1))
-    restored = make_learner(config, seed=9)
-    restored.restore(arrays, values)
-    np.testing.assert_array_equal(learn(restored, 3, np.random.default_rng(1)), expected)
-    policies = [each.policy({"observation_shape": [3]}) for each in (learner, restored)]
-    np.testing.assert_array_equal(*[policy(OBSERVATION) for policy in policies])
-    assert not learner.has_diverged()
+    check_learning_resumes(resolve_preset(None, "ppo", SETTINGS))
 
 
 def test_exported_policy_acts_as_the_model():
