@@ -29,9 +29,8 @@ from guiderail.systems.wrench_limits import PhaseWrenchLimit
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.project import EXPORTED, governor_arrays, policy_arrays, skill_arrays
-from guiderail_cpp.recording import double_action, record_skill
-from guiderail_cpp.skill import GUIDED, load_skill
+from guiderail_cpp.project import governor_arrays, policy_arrays
+from guiderail_cpp.recording import double_action
 from guiderail_cpp.templates import template_arrays
 
 Files = tuple[bytes, bytes]
@@ -85,7 +84,9 @@ def held(scale: float, size: int, repeat: int = 5, limit: float = np.inf) -> Cal
     return draw
 
 
-def _primitive(config: PrimitiveConfig, *, history: bool, scale: float, steps: int, pose_noise: float = 0.0) -> Files:
+def _primitive(
+    config: PrimitiveConfig, *, history: bool, scale: float, steps: int, pose_noise: float = 0.0, episode: int = EPISODE
+) -> Files:
     rng, outputs = np.random.default_rng(0), config.num_outputs
     law = make_law(PriorKnowledge(config.control_period, primitive=config, pose_size=outputs), history=history)
     first = config.reference.means[0]
@@ -94,7 +95,7 @@ def _primitive(config: PrimitiveConfig, *, history: bool, scale: float, steps: i
         start=lambda rng: first + 1e-3 * rng.normal(size=outputs),
         action=held(scale, config.num_actions),
         near=lambda rng, command: command + pose_noise * rng.normal(size=outputs),
-        episode=law.primitive.num_steps,
+        episode=min(law.primitive.num_steps, episode),
     )  # fmt: skip
     return _files(primitive_arrays(law), recording)
 
@@ -116,7 +117,7 @@ def skgrl(steps: int) -> Files:
 def skgrl_measured(steps: int) -> Files:
     history = {"history": 4, "history.source": "measured", "history.variance": 1e-8}
     config = connector(guidance="skgrl", **history)
-    return _primitive(config, history=True, scale=8.0, steps=steps, pose_noise=2e-5)
+    return _primitive(config, history=True, scale=8.0, steps=steps // 2, pose_noise=2e-5, episode=160)
 
 
 def skgrl_oblique(steps: int) -> Files:
@@ -142,18 +143,21 @@ def equal_bounds(steps: int) -> Files:
     lower[:, [0, 1, 4]], upper[:, [0, 1, 4]] = -2e-3, 2e-3
     lower[::3, 4] = upper[::3, 4] = 0.0
     config = replace(config, constraints=LinearConstraints.box(lower, upper))
-    return _primitive(config, history=False, scale=3.0, steps=steps)
+    return _primitive(config, history=False, scale=3.0, steps=steps // 2, episode=160)
 
 
 def _template(template, frames, steps, start, *, velocity=False, period=0.01, limit=0.004, seed=0) -> Files:
+    """Episodes begin at the same pose, because it takes seconds to find one that some templates allow."""
     rng = np.random.default_rng(seed)
+    start = _allowed_start(template, frames, start, rng)
     mapping = load_template("end_effector_velocity") if velocity else None
     law = TemplateLaw(template, frames, period, input_mapping=mapping, max_tracking_error=limit)
     recording = record_law(
-        law, steps, rng,
-        start=lambda rng: _allowed_start(template, frames, start, rng),
+        law, steps // 2, rng,
+        start=lambda rng: start,
         action=held(1.6, (mapping or template).inputs, 10, limit=1.0),
         near=lambda rng, command: command + 2e-3 * rng.normal(size=6),
+        episode=160,
         has_states=True,
     )  # fmt: skip
     data = template_arrays(template, frames)
@@ -388,16 +392,7 @@ def watchdog(steps: int) -> Files:
     return _files({"period": np.array([period]), "timeout": np.array([0.1])}, recording)
 
 
-def whole_skill(steps: int) -> Files:
-    """Observation, policy and guidance of the connector that comes with the package."""
-    skill = load_skill("pretrained:connector", GUIDED, EXPORTED)
-    data, texts, signals = skill_arrays(skill)
-    recording = record_skill(skill, signals, episodes=-(-steps // skill.num_steps))
-    return save(frozen(data), metadata=texts), save(frozen({name: rows[:steps] for name, rows in recording.items()}))
-
-
 LAWS: dict[str, Callable[[int], Files]] = {
-    "whole skill of the connector": whole_skill,
     "kgrl": kgrl,
     "kgrl, equal bounds": equal_bounds,
     "skgrl": skgrl,

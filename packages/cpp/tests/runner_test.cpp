@@ -2,24 +2,19 @@
 // nothing is allocated or thrown.
 #include <cstdint>
 #include <cstdio>
-#include <cstdlib>
 #include <cstring>
 #include <fstream>
 #include <iterator>
 #include <limits>
-#include <new>
 #include <random>
 #include <vector>
 
-static long allocations = 0;
-__attribute__((noinline)) void* operator new(std::size_t size) {
-  ++allocations;
-  return std::malloc(size ? size : 1);
-}
-__attribute__((noinline)) void operator delete(void* memory) noexcept { std::free(memory); }
-__attribute__((noinline)) void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
-
 #include "guiderail/runner.hpp"
+
+// The replay counts allocations, and is compiled with this program, because a program takes seconds to compile.
+#define main replay
+#include "test/replay.cpp"
+#undef main
 
 #define CHECK(condition) \
   if (!(condition)) return std::fprintf(stderr, "line %d: %s\n", __LINE__, #condition), 1
@@ -214,8 +209,9 @@ static int test_garbage(const Data& data, const double* start) {
   return 0;
 }
 
-// runner_test DATA RECORDING, or runner_test DATA to damage only the data.
+// runner_test DATA RECORDING, runner_test DATA to damage only the data, or runner_test replay DATA RECORDING TOLERANCE.
 int main(int argc, char** argv) {
+  if (std::strcmp(argv[1], "replay") == 0) return replay(argc - 1, argv + 1);
   if (argc == 2) return test_damaged(argv[1]);
   const Data data(argv[1]), recording(argv[2]);
   const double* start = recording.get("replay/pose").data();

@@ -67,7 +67,8 @@ def test_exported_loop_replays_the_recording(exported):
     assert float(result.stdout.partition(": ")[2].split()[0]) < 1e-6
 
 
-def test_exported_loop_names_the_missing_extra(exported, tmp_path):
+@pytest.mark.parametrize("exported", ["passage"], indirect=True)
+def test_exported_loop_names_the_missing_extra(exported):
     _, folder, _ = exported
     loop = str(folder / "loop.py")
     code = f"import sys, runpy; sys.modules['onnxruntime'] = None; runpy.run_path({loop!r}, run_name='__main__')"
