@@ -12,22 +12,22 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
 from guiderail_hardware.drivers.driver import safety_limits
 from guiderail_hardware.robot.executor import SkillExecutor
-from guiderail_hardware.robot.sim_driver import START
 
 OPTIONS = {"station": "hardware", "guidance": "kmp", "fixture_offset": "none"}
 
 
 @pytest.fixture(autouse=True, scope="module")
 def shorten_pauses():
-    """Shorten the ramp of the torques and the end of an approach, which are most of the simulated time.
+    """Shorten the pauses before and after motions, which are most of the simulated time.
 
     Collections of garbage between episodes are left out, because they would traverse the objects of all tests.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             "guiderail_hardware.station.safety_limits",
-            lambda plant, driver: replace(safety_limits(plant, driver), ramp_time=0.1),
+            lambda plant, driver: replace(safety_limits(plant, driver), ramp_time=0.1, damping_time=0.1),
         )
+        patch.setattr("guiderail_hardware.drivers.driver.Driver.hold_off", 0.15)
         patch.setattr("guiderail_hardware.robot.preflight.SETTLING_TIME", 0.1)
         patch.setattr("guiderail_hardware.robot.robot_env.gc", SimpleNamespace(collect=lambda: 0))
         yield
@@ -35,14 +35,18 @@ def shorten_pauses():
 
 @pytest.fixture
 def make_executor(monkeypatch):
-    """Return a function that builds an executor, with the clock that steps its simulated robot."""
+    """Return a function that builds an executor, with the clock that steps its simulated robot.
+
+    By default, the arm begins at the skill's start. Step 95 of the clock is then in the approach, and step 130 in the
+    skill.
+    """
 
     def make_executor(
-        start=START,
+        start=None,
         policy=lambda observation: np.zeros(2),
-        num_steps=20,
+        num_steps=10,
         is_stop_requested=lambda: False,
-        has_monitor=True,
+        has_monitor=False,
         **options,
     ):
         lcm = DrakeLcm("memq://")
@@ -51,6 +55,7 @@ def make_executor(monkeypatch):
             patch.setattr("guiderail_hardware.drivers.lcm.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS, **options)
         task = EnvConfig.resolve("BncConnector", OPTIONS | options).declared
+        start = task.start_pose(np.random.default_rng(0)) if start is None else start
         clock = SteppedRobotClock(task.workcell(), lcm, start, has_monitor)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return SkillExecutor(task, skill, clock, is_stop_requested), clock

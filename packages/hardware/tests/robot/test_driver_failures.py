@@ -16,13 +16,11 @@ def scalar_status():
 
 @pytest.mark.parametrize(
     ("step", "method", "replacement", "fault", "reason"),
-    [  # in step 120 during the approach, in step 210 during the skill
-        (120, "read", unplugged, Fault.MALFORMED, "read raised OSError: cable unplugged"),
-        (120, "receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
-        (210, "receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
-        (210, "read", scalar_status, Fault.WRONG_SIZE, "wrong number of joints"),
-        (120, "read", lambda: None, Fault.NO_STATUS, "no status message"),
-        (210, "read", lambda: None, Fault.NO_STATUS, "no status message"),
+    [  # in step 95 during the approach, in step 130 during the skill
+        (95, "read", unplugged, Fault.MALFORMED, "read raised OSError: cable unplugged"),
+        (130, "receive", unplugged, Fault.MALFORMED, "receive raised OSError: cable unplugged"),
+        (95, "read", scalar_status, Fault.WRONG_SIZE, "wrong number of joints"),
+        (130, "read", lambda: None, Fault.NO_STATUS, "no status message"),
     ],
 )
 def test_arm_rests_when_the_driver_fails(make_executor, step, method, replacement, fault, reason):
@@ -31,9 +29,9 @@ def test_arm_rests_when_the_driver_fails(make_executor, step, method, replacemen
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (fault, 1)
     assert reason in outcome.description
-    assert (outcome.steps > 0) == (step == 210)
+    assert (outcome.steps > 0) == (step == 130)
     assert max_joint_speed(clock) < 0.02
-    assert clock.step >= step + 60  # the station continues until the arm is at rest
+    assert clock.step >= step + 40  # the station continues until the arm is at rest
 
 
 @pytest.mark.parametrize("method", ["read", "receive"])
@@ -48,10 +46,10 @@ def test_arm_rests_when_driver_and_policy_fail(make_executor, method):
         setattr(executor._station.driver, method, unplugged if method == "receive" else lambda: None)
         return np.full(2, np.nan)
 
-    executor, clock = make_executor(policy=act)
+    executor, clock = make_executor(policy=act, num_steps=20)
     with pytest.raises(PolicyError):
         executor.run(print)
-    assert clock.step >= requests[-1] + 60
+    assert clock.step >= requests[-1] + 40
     assert max_joint_speed(clock) < 0.02
 
 
@@ -77,7 +75,7 @@ def test_failed_commands_are_reported_and_retried(make_executor):
         attempts.append(clock.step)
         unplugged()
 
-    clock.happens[120] = lambda: setattr(driver, "write", write)
+    clock.happens[95] = lambda: setattr(driver, "write", write)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (Fault.COMMAND_FAILED, 1)
     assert outcome.description.startswith(
@@ -104,7 +102,7 @@ def test_completed_skill_fails_when_the_arm_cannot_be_stopped(make_executor, mon
 
     monkeypatch.setattr(executor, "_rest", rest_without_commands)
     outcome = executor.run(print)
-    assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.COMMAND_FAILED, 1, 20)
+    assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.COMMAND_FAILED, 1, 10)
     failure = f"{failures} commands that bring the arm to rest could not be sent: write raised OSError: cable unplugged"
     assert outcome.description == f"executed to its end; {failure}"
     assert max_joint_speed(clock) < 0.01
@@ -118,7 +116,7 @@ def test_first_exception_is_raised_when_commands_fail_as_well(make_executor):
         executor._station.driver.write = unplugged
         raise KeyboardInterrupt
 
-    clock.happens[120] = lambda: executor._simulator.set_monitor(interrupt)
+    clock.happens[95] = lambda: executor._simulator.set_monitor(interrupt)
     with pytest.raises(KeyboardInterrupt):
         executor.run(messages.append)
     assert "commands that bring the arm to rest could not be sent: write raised OSError" in messages[-1]

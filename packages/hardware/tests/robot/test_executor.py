@@ -31,20 +31,20 @@ from guiderail_hardware.station import HardwareStation
 
 
 def test_executor_approaches_executes_rests_and_records(make_executor, tmp_path):
-    executor, clock = make_executor(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+    executor, clock = make_executor(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0], has_monitor=True)
     checks = executor.preflight.run()
     assert failed_checks(checks) == []
     assert checks[0].description.startswith("iiwa14, 7 joints")
     messages = []
     outcome = executor.run(messages.append)
-    assert (outcome.description, outcome.steps, outcome.exit_code) == ("executed to its end", 20, 0)
+    assert (outcome.description, outcome.steps, outcome.exit_code) == ("executed to its end", 10, 0)
     np.testing.assert_allclose(executor.trace.measured[0][:3], executor._start[:3], atol=3e-3)
     assert (executor.trace.signals["arm_state"] == 2).all()
     assert max_joint_speed(clock) < 0.01
     metadata = {"outcome": outcome.description, "statuses": {"99 %": np.nan, "longest": np.inf}}
     path = executor.write(tmp_path, metadata)[0]
     step_log = pd.read_parquet(path)
-    assert len(step_log) == 20
+    assert len(step_log) == 10
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(step_log)
     written = json.loads(path.with_suffix(".json").read_text(), parse_constant=pytest.fail)
     assert written == {"outcome": "executed to its end", "statuses": {"99 %": None, "longest": None}}
@@ -101,9 +101,9 @@ def test_recording_is_in_a_temporary_folder_when_out_is_full(make_executor, monk
 
     monkeypatch.setattr(executing, "write_step_log", write_outside)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    executor.save(tmp_path / "full", executing.Outcome(Fault.NONE, executing.COMPLETED, 20), {}, messages.append)
+    executor.save(tmp_path / "full", executing.Outcome(Fault.NONE, executing.COMPLETED, 10), {}, messages.append)
     (file,) = tmp_path.glob("guiderail-*/episode-000000.parquet")
-    assert len(pd.read_parquet(file)) == 20
+    assert len(pd.read_parquet(file)) == 10
     assert file.with_suffix(".json").exists()
     assert messages[-1].startswith("the motion was executed, but ")
     assert messages[-1].endswith(f"cannot be written, so the record is in {file}")
@@ -126,7 +126,7 @@ def test_arm_rests_when_the_policy_returns_nan(make_executor, num_valid):
         requests.append(observation)
         return np.full(2, 0.0 if len(requests) <= num_valid else np.nan)
 
-    executor, clock = make_executor(policy=policy)
+    executor, clock = make_executor(policy=policy, num_steps=20)
     torques = record_torques(executor)
     with pytest.raises(PolicyError):
         executor.run(print)
@@ -139,7 +139,7 @@ def test_arm_rests_when_a_step_of_the_approach_raises(make_executor):
         raise KeyboardInterrupt
 
     executor, clock = make_executor()
-    clock.happens[120] = lambda: executor._simulator.set_monitor(interrupt)
+    clock.happens[95] = lambda: executor._simulator.set_monitor(interrupt)
     torques = record_torques(executor)
     with pytest.raises(KeyboardInterrupt):
         executor.run(print)
@@ -187,7 +187,7 @@ def test_approach_has_the_force_limit_of_the_skill(make_executor):
 
 def test_execution_ends_when_statuses_stop(make_executor):
     executor, clock = make_executor()
-    clock.happens[150] = lambda: setattr(clock, "is_silent", True)
+    clock.happens[130] = lambda: setattr(clock, "is_silent", True)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (Fault.STALE, 1)
 
@@ -199,10 +199,10 @@ def test_executor_does_not_wait_when_the_simulation_has_ended(make_executor):
         raise DriverEndedError("the simulated driver has ended")
 
     executor, clock = make_executor()
-    clock.happens[120] = end
+    clock.happens[95] = end
     with pytest.raises(DriverEndedError):
         executor.run(print)
-    assert clock.step < 130
+    assert clock.step < 105
 
 
 def test_checks_name_the_statuses_when_the_driver_is_silent(make_executor):
@@ -215,7 +215,7 @@ def test_checks_name_the_statuses_when_the_driver_is_silent(make_executor):
 def test_execution_ends_when_the_operator_stops(make_executor):
     stops = []
     executor, clock = make_executor(is_stop_requested=lambda: bool(stops))
-    clock.happens[120] = lambda: stops.append(True)
+    clock.happens[95] = lambda: stops.append(True)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.USER_STOP, 1, 0)
 
@@ -249,7 +249,7 @@ def test_execution_ends_above_the_force_limit_of_the_task(make_executor):
 
 
 def test_start_check_fails_when_the_arm_is_far_away(make_executor):
-    executor, _ = make_executor(START + [0.0, 0.0, 0.16, 0.0, 0.0, 0.0])
+    executor, _ = make_executor(START + [0.0, 0.0, 0.16, 0.0, 0.0, 0.0], has_monitor=True)
     assert failed_checks(executor.preflight.run()) == ["start"]
 
 
@@ -311,16 +311,6 @@ def test_confirm_checks_raises_when_a_check_fails():
     assert messages == ["NOT   load        9 N"]
 
 
-def test_confirm_checks_repeats_the_checks_after_the_question(make_executor, monkeypatch):
-    executor, clock = make_executor()
-    displaced = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
-    monkeypatch.setattr(
-        preflight, "confirm", lambda question: clock.robot.set_pose(clock.simulator.get_mutable_context(), displaced)
-    )
-    with pytest.raises(InputError, match="stays where it is: start"):
-        preflight.confirm_checks(executor.preflight, print, assume_yes=False)
-
-
 def test_force_check_shows_the_largest_commanded_force(make_executor):
     executor, _ = make_executor()
     (force,) = [check.description for check in executor.preflight.run() if check.name == "force"]
@@ -344,7 +334,7 @@ def test_deploy_raises_before_the_bus_opens_when_out_is_full(monkeypatch, tmp_pa
 
 
 def test_monitor_check_fails_without_a_heartbeat(make_executor):
-    executor, _ = make_executor(has_monitor=False)
+    executor, _ = make_executor()
     assert failed_checks(executor.preflight.run()) == ["monitor"]
 
 
