@@ -1,4 +1,4 @@
-"""Program that plays a robot with ROS 2 on the loopback interface, with faults of network and robot.
+"""Program that plays a robot with ROS 2 on the loopback interface, with faults of the network.
 
 It publishes joint states and wrenches, and records the targets that it receives. A line on its standard input ends it;
 it then prints the number of targets, the last one, and the controllers that it was asked to switch to, as JSON.
@@ -78,20 +78,13 @@ def play(address: str, faults: dict, stop: TextIO | Connection) -> dict:
         now = time.time()
         if now - start > number * PERIOD and not (faults.get("silent_after") and now - start > faults["silent_after"]):
             number += 1
-            is_faulty = now - start > faults.get("after", 1.0)
-            stamp = now + (faults.get("clock_jump", 0.0) if is_faulty else 0.0)
-            q = POSITIONS + 0.05 * np.sin(now - start) + (faults.get("jump", 0.0) if is_faulty else 0.0)
+            q = POSITIONS + 0.05 * np.sin(now - start)
             v = np.full(7, 0.05 * np.cos(now - start))
-            if is_faulty and faults.get("not_finite"):
-                v[3] = np.nan
-            used = names[:6] if is_faulty and faults.get("missing_joint") else names
-            order = [int(name[-1]) - 1 for name in used]
-            header = messages.Header(messages.Time(int(stamp), int(1e9 * (stamp % 1.0))), "base")
-            joints = messages.JointState(header, used, q[order].tolist(), v[order].tolist(), [0.0] * len(used))
+            order = [int(name[-1]) - 1 for name in names]
+            header = messages.Header(messages.Time(int(now), int(1e9 * (now % 1.0))), "base")
+            joints = messages.JointState(header, names, q[order].tolist(), v[order].tolist(), [0.0] * len(names))
             wrench = messages.WrenchStamped(header, messages.Wrench(messages.Vector3(0.0, 0.0, 5.0)))
-            sent = [(bus.joints, joints)]
-            if not (is_faulty and faults.get("no_wrench")):
-                sent.insert(0, (bus.wrench, wrench))
+            sent = [(bus.wrench, wrench), (bus.joints, joints)]
             for writer, message in sent:
                 if rng.random() >= faults.get("loss", 0.0):
                     delay = faults.get("latency", 0.0) * (1.0 + rng.uniform(-1.0, 1.0) * faults.get("jitter", 0.0))
