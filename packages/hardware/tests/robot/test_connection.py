@@ -1,5 +1,6 @@
 """Connection to a simulated driver: options, addresses, imported modules, and the end of its process."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -152,39 +153,44 @@ def test_loopback_addresses_of_processes_differ():
     assert all(ip_address(address).is_loopback for address in addresses)
 
 
-# Code of a parent process: `context` starts a child that sleeps, or a simulated driver.
-SLEEPING_CHILD = """
-from guiderail_hardware.robot.connection import subprocess_tied_to_parent
-
-context = subprocess_tied_to_parent("import time; time.sleep(60)")
-"""
-
 SIMULATED_DRIVER = """
 from guiderail_hardware.robot.connection import RobotConnection
 
-context = RobotConnection(sim=True, synchronous=True).simulated_driver("BncConnector", "memq://")
-"""
-
-WAIT_FOR_INPUT = """
-with context:
+with RobotConnection(sim=True, synchronous=True).simulated_driver("BncConnector", "memq://"):
     print("started", flush=True)
     input()
 """
 
 
-@pytest.mark.parametrize(
-    ("code", "end_signal"),
-    [(SLEEPING_CHILD, signal.SIGTERM), (SLEEPING_CHILD, signal.SIGINT), (SIMULATED_DRIVER, signal.SIGKILL)],
-    ids=["terminated", "interrupted", "killed"],
-)
-def test_child_exits_when_the_parent_ends(code, end_signal):
-    command = [sys.executable, "-c", code + WAIT_FOR_INPUT]
+def test_simulated_driver_exits_when_the_parent_is_killed():
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, **pipes) as parent:
+    with subprocess.Popen([sys.executable, "-c", SIMULATED_DRIVER], **pipes) as parent:
         assert parent.stdout.readline() == b"started\n"
-        parent.send_signal(end_signal)
+        parent.kill()
         # Parent and child have the same standard output, which is closed when both have ended.
         assert parent.communicate(timeout=50)[0] == b""
+
+
+def start_child(connection):
+    """Start a child whose standard output is a connection, and wait."""
+    os.dup2(connection.fileno(), 1)
+    with subprocess_tied_to_parent("import time; time.sleep(60)"):
+        connection.send("started")
+        time.sleep(60)
+
+
+@pytest.mark.parametrize("end_signal", [signal.SIGTERM, signal.SIGINT])
+def test_child_exits_when_the_parent_ends(end_signal, forkserver):
+    context = multiprocessing.get_context("forkserver")
+    connection, child_end = context.Pipe()
+    parent = context.Process(target=start_child, args=(child_end,), daemon=True)
+    parent.start()
+    child_end.close()
+    assert connection.recv() == "started"
+    os.kill(parent.pid, end_signal)
+    assert connection.poll(50)
+    with pytest.raises((EOFError, ConnectionResetError)):  # parent and child have closed the connection
+        connection.recv()
 
 
 def test_child_is_ended_and_its_pipe_closed_after_the_block():
