@@ -14,7 +14,6 @@ STATUS, COMMAND = "on_status", "on_command"
 INJECTIONS = [
     faults.message_loss(STATUS, 0.015),
     faults.message_loss(STATUS, 0.06),
-    faults.message_delay(STATUS, 0.03),
     faults.message_delay(STATUS, 0.05),
     faults.message_duplication(STATUS, 0.02),
     faults.message_swap(STATUS, 3),
@@ -24,14 +23,11 @@ INJECTIONS = [
     faults.status_jump("joint_velocity_estimated", 5, 5.0, 8),
     faults.external_load(4, 120.0),
     faults.clock_jump(-3.0),
-    faults.clock_jump(1e4),
     faults.message_loss(COMMAND, 0.015),
-    faults.message_loss(COMMAND, 0.06),
     faults.controller_pause(0.015),
     faults.controller_pause(0.3),
     faults.controller_kill(0.06),
     faults.robot_kill(0.05),
-    faults.robot_kill(0.1),
     faults.monitor_kill(0.1),
 ]
 
@@ -62,12 +58,12 @@ def test_contact_with_a_rim_is_no_fault(monkeypatch):
 
     def desired():
         elapsed = (bus.step - begin) * PERIOD
-        down = np.clip(speed * (elapsed - 1.2), 0.0, depth)
-        return START + min(elapsed, 1.0) * beside - [0.0, 0.0, down, 0.0, 0.0, 0.0]
+        down = np.clip(speed * (elapsed - 0.6), 0.0, depth)
+        return START + min(elapsed / 0.5, 1.0) * beside - [0.0, 0.0, down, 0.0, 0.0, 0.0]
 
     monkeypatch.setattr(bus, "desired", desired)
     bus.run_until_following(0.0)
-    while (bus.step - begin) * PERIOD < 1.2 + depth / speed + 0.3:
+    while (bus.step - begin) * PERIOD < 0.6 + depth / speed + 0.3:
         bus.step_once()
         assert not bus.is_detected, (bus.step * PERIOD, bus.fault, bus.monitor.fault)
     assert bus.arm_state == ArmState.RUNNING
