@@ -1,6 +1,7 @@
 """Drivers: a user's driver with only `read` and `write`, registration, and refused drivers and robots."""
 
 import re
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -99,6 +100,17 @@ def test_driver_is_refused_when_super_init_is_not_called():
 
     with pytest.raises(InputError, match=r"Incomplete must call super\(\).__init__\(url\) in its constructor"):
         HardwareStation(BncWorkcell(), Incomplete())
+
+
+@pytest.mark.parametrize(
+    ("driver", "module", "extra"), [(FciDriver, "franky", "fci"), (RtdeDriver, "rtde_control", "rtde")]
+)
+def test_driver_needs_a_host_and_its_client(driver, module, extra, monkeypatch):
+    with pytest.raises(InputError, match="--robot-url"):
+        driver()
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=rf"guiderail\[{extra}\]"):
+        driver("192.0.2.1")
 
 
 def raise_no_port(url):

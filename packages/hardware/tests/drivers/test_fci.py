@@ -170,17 +170,6 @@ def motions(robot):
     return [args[0] for name, args, _ in robot.calls if name == "move"]
 
 
-def test_driver_raises_without_a_host():
-    with pytest.raises(InputError, match="--robot-url"):
-        FciDriver()
-
-
-def test_driver_names_the_extra_when_the_client_is_missing(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "franky", None)
-    with pytest.raises(InputError, match=r"guiderail\[fci\]"):
-        FciDriver("192.0.2.1")
-
-
 def test_motion_limits_are_within_the_published_limits():
     limits, published = FciDriver.motion_limits, FRANKA_LIMITS
     assert (np.array(limits.linear + limits.angular) <= np.array(published.linear + published.angular)).all()
@@ -361,17 +350,11 @@ def test_poses_update_a_single_motion_until_the_stop(driver, robot):
     assert isinstance(motions(robot)[2], Motion)
 
 
-def test_write_pose_raises_before_the_configuration(robot):
-    driver = FciDriver("192.0.2.1", client=client(robot))
-    driver.read()
-    with pytest.raises(InputError, match="configured"):
-        driver.write_pose(RigidTransform(), 0.0)
-
-
 def test_methods_raise_before_the_first_status(robot, model):
     driver = FciDriver("192.0.2.1", client=client(robot))
-    with pytest.raises(InputError, match="before it is configured"):
-        driver.check_setup()
+    for call in (driver.check_setup, lambda: driver.write_pose(RigidTransform(), 0.0)):
+        with pytest.raises(InputError, match="before it is configured"):
+            call()
     for call in (lambda: driver.configure(make_robot_impedance(model, IMPEDANCE)), driver.recover):
         with pytest.raises(InputError, match="the driver fci is used before it has read a status"):
             call()

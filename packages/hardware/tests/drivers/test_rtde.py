@@ -65,17 +65,6 @@ def model_pose(model, driver):
     return model.tool_center.CalcPoseInWorld(context)
 
 
-def test_driver_raises_without_a_host():
-    with pytest.raises(InputError, match="--robot-url"):
-        RtdeDriver()
-
-
-def test_driver_names_the_extra_when_the_client_is_missing(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rtde_control", None)
-    with pytest.raises(InputError, match=r"guiderail\[rtde\]"):
-        RtdeDriver("192.0.2.1")
-
-
 def test_configuration_sets_tool_and_payload(robot, driver, impedance):
     np.testing.assert_allclose(robot.tcp[:3], impedance.X_FlangeTool.translation(), atol=1e-9)
     np.testing.assert_allclose(robot.payload[0], impedance.mass)
@@ -232,13 +221,10 @@ def test_write_pose_raises_when_the_kinematics_differ(robot, driver, model, shar
         driver.write_pose(model_pose(model, driver), 0.0)
 
 
-def test_write_pose_raises_before_the_configuration():
-    with pytest.raises(InputError, match="configured"):
-        RtdeDriver("192.0.2.1", client=SimpleNamespace()).write_pose(RigidTransform(), 0.0)
-
-
 def test_methods_raise_before_the_first_status(impedance):
     driver = RtdeDriver("192.0.2.1", client=SimpleNamespace())
+    with pytest.raises(InputError, match="configured"):
+        driver.write_pose(RigidTransform(), 0.0)
     for call in (lambda: driver.configure(impedance), driver.check_setup, driver.recover):
         with pytest.raises(InputError, match="the driver rtde is used before it has read a status"):
             call()

@@ -96,15 +96,29 @@ def test_driver_selects_robot_and_lockstep():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "has only the task's surroundings"),
-        ({"driver": "fci", "joint_friction": -0.1}, "joint_friction must be at least 0 and finite, not -0.1"),
-        ({"joint_friction": "0.1"}, "joint_friction must be at least 0 and finite, not '0.1'"),
-        ({"rate": "0.2"}, "the rate .* is from 0.001 to 1, not '0.2'"),
+        ({"synchronous": True}, "does not wait"),
+        ({"sim": True, "robot": "panda"}, "have a simulated robot"),
+        ({"sim": True, "robot": "pnda"}, "did you mean panda"),
+        ({"rate": 0.0}, "from 0.001 to 1, not 0.0"),
+        ({"rate": 1e-9, "sim": True}, "from 0.001 to 1, not 1e-09"),
+        ({"rate": 0.5}, "--rate is for a simulated driver, --sim"),
+        ({"rate": 0.5, "sim": True, "synchronous": True}, "leave --rate out"),
+        ({"rate": 0.5, "sim": True, "driver": "fci"}, "leave --rate out"),
+        (
+            {"sim": True, "driver": "fci", "scenario": Path("connector.scenario.yaml")},
+            "has only the task's surroundings",
+        ),
+        (
+            {"sim": True, "driver": "fci", "joint_friction": -0.1},
+            "joint_friction must be at least 0 and finite, not -0.1",
+        ),
+        ({"sim": True, "joint_friction": "0.1"}, "joint_friction must be at least 0 and finite, not '0.1'"),
+        ({"sim": True, "rate": "0.2"}, "the rate .* is from 0.001 to 1, not '0.2'"),
     ],
 )
-def test_connection_raises_when_simulation_options_are_invalid(options, message):
+def test_connection_raises_when_options_are_invalid(options, message):
     with pytest.raises(InputError, match=message):
-        RobotConnection(sim=True, **options)
+        RobotConnection(**options)
 
 
 @pytest.mark.parametrize(("run", "folder"), [("runs/peg", "runs/peg/hardware"), ("pretrained:clamp", "clamp/hardware")])

@@ -170,7 +170,11 @@ def test_default_speeds_are_0_25_m_per_s_and_1_5_rad_per_s():
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"period": 0.0}, *({name: value} for name in ("speed", "angular_speed") for value in (0.0, np.inf))]
+    "arguments",
+    [
+        *({"period": value} for value in (0.0, None)),
+        *({name: value} for name in ("speed", "angular_speed") for value in (0.0, np.inf)),
+    ],
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):

@@ -93,6 +93,10 @@ def test_commanded_torque_is_passed_through_without_faults(plant):
     rig = Rig(plant)
     np.testing.assert_array_equal(rig["safe_torque"], COMMANDED)
     assert (rig.fault, rig["is_sending"][0], rig["not_following"][0]) == (Fault.NONE, 1.0, 0.0)
+    with pytest.raises(InputError, match="is running"):
+        rig.system.resume(rig.context)
+    rig.set(command_timed_out=[1.0])
+    assert (rig.arm_state, rig["not_following"][0]) == (ArmState.RUNNING, 1.0)
 
 
 def test_torque_ramps_up_when_the_status_becomes_valid(plant):
@@ -158,12 +162,6 @@ def test_fault_stops_the_arm_until_a_resume(plant, fault):
     assert (rig.arm_state, rig.fault, rig["blend_factor"][0]) == (ArmState.RAMPING, Fault.NONE, 0.0)
     rig.advance(LIMITS.ramp_time + 2 * PERIOD)
     assert rig.arm_state == ArmState.RUNNING
-
-
-def test_desired_pose_outside_the_workspace_stops_the_arm(plant):
-    rig = Rig(plant)
-    rig.set(desired_pose=[0.21, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert rig.fault == Fault.WORKSPACE_LIMIT
 
 
 POSITION, VELOCITY = [*([np.nan] * n), *SPEED], [*POSTURE, *([np.nan] * n)]
@@ -266,12 +264,6 @@ def test_resume_is_refused_while_a_fault_is_present(plant):
     assert rig.arm_state == ArmState.OFF
 
 
-def test_torque_is_within_its_limits(plant):
-    rig = Rig(plant)
-    rig.set(torque=np.linspace(-200.0, 200.0, n))
-    np.testing.assert_array_equal(rig["safe_torque"], np.clip(np.linspace(-200.0, 200.0, n), -20.0, 20.0))
-
-
 def test_commanded_torque_fades_out_when_the_status_is_old(plant):
     rig = Rig(plant)
     sent = []
@@ -359,12 +351,6 @@ def test_resume_is_refused_while_the_reported_speed_is_large(plant):
     rig.set(reported_speed=[0.149])
     rig.advance(0.15 + 2 * PERIOD)
     rig.system.resume(rig.context)
-
-
-def test_resume_is_refused_when_the_arm_is_not_stopped(plant):
-    rig = Rig(plant)
-    with pytest.raises(InputError, match="is running"):
-        rig.system.resume(rig.context)
 
 
 def test_limits_have_their_documented_defaults():
@@ -492,12 +478,6 @@ def test_ramping_damps_the_estimated_velocity(plant):
     np.testing.assert_allclose(rig["safe_torque"], np.clip(expected, -20.0, 20.0), atol=1e-12)
 
 
-def test_not_following_is_set_when_commands_time_out(plant):
-    rig = Rig(plant)
-    rig.set(command_timed_out=[1.0])
-    assert (rig.arm_state, rig["not_following"][0]) == (ArmState.RUNNING, 1.0)
-
-
 ABOVE = 1.001  # factor of a limit
 BEYOND_LIMIT = {
     "velocity": {"estimated_state": [*POSTURE, *SPEED[:-1], ABOVE]},
@@ -518,7 +498,8 @@ def test_fault_is_raised_just_beyond_each_limit(plant, limit):
     rig = Rig(plant)
     assert rig.fault == Fault.NONE
     rig.set(**BEYOND_LIMIT[limit])
-    assert rig.fault != Fault.NONE
+    name = "workspace" if "pose" in limit else limit.partition(",")[0].replace(" ", "_")
+    assert rig.fault == Fault[f"{name}_limit".upper()]
 
 
 def test_torque_just_beyond_its_limit_is_clipped(plant):
@@ -537,21 +518,11 @@ def test_damping_lasts_for_the_damping_time(plant, state):
     assert rig["safe_torque"].any() == (state == ArmState.DAMPING)
 
 
-@pytest.mark.parametrize(("steps", "is_sending"), [(12, 1.0), (13, 0.0)])
-def test_zero_torque_is_sent_for_the_zero_torque_time(plant, steps, is_sending):
-    assert 12 * PERIOD <= ZERO_TORQUE_TIME == 0.05 < 13 * PERIOD
-    rig = Rig(plant)
-    rig.set(status_fault=[Fault.STALE])
-    while rig.arm_state != ArmState.OFF:
-        rig.advance(PERIOD)
-    rig.advance(steps * PERIOD)
-    assert rig["is_sending"][0] == is_sending
-
-
 @pytest.mark.parametrize(("seconds", "is_sending"), [(0.05, 1.0), (0.05002, 0.0)])
 def test_sending_ends_just_after_the_zero_torque_time(plant, seconds, is_sending):
     rig = Rig(plant)
     rig.set(status_fault=[Fault.STALE])
+    assert ZERO_TORQUE_TIME == 0.05
     rig.context.SetDiscreteState(0, [ArmState.OFF, Fault.STALE, seconds, 0.0, 0.0, 0.0])
     assert rig["is_sending"][0] == is_sending
 

@@ -215,36 +215,58 @@ def test_corrections_compensate_demonstrations_5_mm_off(tmp_path):
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
-def assert_refused(learner, message, folder, episodes):
-    """Train with a learner that is registered for the test only, and expect an `InputError`."""
-    LEARNERS.register("invalid")(learner)
+def returns(value):
+    """Return a method that returns a value."""
+    return lambda self, *arguments, **keywords: value
+
+
+def on_episode_end(*columns):
+    return {"on_episode_end": lambda self, row: columns[row["episode"]]}
+
+
+def activation_no(self, description):
+    return ZeroLearner.policy(self, {**description, "activation": "no"})
+
+
+FAILURE = r"failed: test_interventions\.py, line \d+: ZeroDivisionError"
+# Methods of a learner, and what its refusal says.
+INVALID = {
+    "column of another": (on_episode_end({"return": 0.0}), "returns the column 'return', which"),
+    "text": (on_episode_end({"word": "good"}), "the column 'word' of an episode must be a number, not 'good'"),
+    "other column": (on_episode_end({"a": 1}, {"b": 1}), "the column 'a' is missing in some episodes"),
+    "no policy": ({"policy": returns(None)}, "Invalid.policy must return a Policy, not None"),
+    "wrong policy": ({"policy": activation_no}, "Invalid.policy failed: a policy has no activation 'no'"),
+    "array of texts": (
+        {"state": returns(({"words": np.array(["a"])}, {}))},
+        "the array 'words' of Invalid.state has no numbers",
+    ),
+    "array as value": (
+        {"state": returns(({}, {"mean": np.zeros(2)}))},
+        "the values of Invalid.state must be values of JSON: Object of type ndarray",
+    ),
+    "tuple": (
+        {"state": returns(({}, {"a": [{"b": (1, 2)}]}))},
+        r"the values of Invalid.state must not contain the tuple \(1, 2\), because JSON",
+    ),
+    "number as key": (
+        {"state": returns(({}, {"a": {3: 4}}))},
+        "the values of Invalid.state must not contain the key 3, because JSON changes it",
+    ),
+    "failing constructor": ({"__init__": lambda *_, **__: 1 / 0}, f"constructing the learner Invalid {FAILURE}"),
+    "failing method": ({"act": lambda *_: 1 / 0}, rf"Invalid\.act {FAILURE}: division by zero"),
+}
+
+
+@pytest.mark.parametrize("name", INVALID)
+def test_invalid_learner_is_named(name, tmp_path):
+    methods, message = INVALID[name]
+    LEARNERS.register("invalid")(type("Invalid", (ZeroLearner,), methods))
+    config = configure("Bead", {}, algorithm="invalid", episodes=2 if name == "other column" else 1, seed=1)
     try:
         with pytest.raises(InputError, match=message):
-            run_training(RunFolder(folder), configure("Bead", {}, algorithm="invalid", episodes=episodes, seed=1))
+            run_training(RunFolder(tmp_path / "run"), config)
     finally:
         del LEARNERS._entries["invalid"]
-
-
-@pytest.mark.parametrize(
-    ("columns", "policy", "message"),
-    [
-        ([{"return": 0.0}], Policy, "returns the column 'return', which"),
-        ([{"word": "good"}], Policy, "the column 'word' of an episode must be a number, not 'good'"),
-        ([{"a": 1}, {"b": 1}], Policy, "the column 'a' is missing in some episodes"),
-        ([{}, {}], None, "Invalid.policy must return a Policy, not None"),
-        ([{}, {}], "no", "Invalid.policy failed: a policy has no activation 'no'"),
-    ],
-)
-def test_learner_with_an_invalid_return_value_is_named(columns, policy, message, tmp_path):
-    class Invalid(ZeroLearner):
-        def on_episode_end(self, row):
-            return columns[row["episode"]]
-
-        def policy(self, description):
-            activation = {"activation": policy} if isinstance(policy, str) else {}
-            return super().policy({**description, **activation}) if policy else None
-
-    assert_refused(Invalid, message, tmp_path / "run", episodes=2)
 
 
 @pytest.mark.parametrize(
@@ -258,36 +280,3 @@ def test_learner_that_cannot_be_constructed_is_refused(name, learner, message):
     with pytest.raises(InputError, match=message):
         LEARNERS.register(name)(learner)
     assert name not in LEARNERS.names()
-
-
-@pytest.mark.parametrize(
-    ("state", "message"),
-    [
-        (({"words": np.array(["a"])}, {}), "the array 'words' of Invalid.state has no numbers"),
-        (({}, {"mean": np.zeros(2)}), "the values of Invalid.state must be values of JSON: Object of type ndarray"),
-        (
-            ({}, {"a": [{"b": (1, 2)}]}),
-            r"the values of Invalid.state must not contain the tuple \(1, 2\), because JSON",
-        ),
-        (({}, {"a": {3: 4}}), "the values of Invalid.state must not contain the key 3, because JSON changes it"),
-    ],
-)
-def test_state_that_cannot_be_stored_is_named(state, message, tmp_path):
-    class Invalid(ZeroLearner):
-        def state(self):
-            return state
-
-    assert_refused(Invalid, message, tmp_path / "run", episodes=1)
-
-
-@pytest.mark.parametrize(
-    ("method", "message"),
-    [
-        ("__init__", r"constructing the learner Invalid failed: test_interventions\.py, line \d+: ZeroDivisionError"),
-        ("act", r"Invalid\.act failed: test_interventions\.py, line \d+: ZeroDivisionError: division by zero"),
-    ],
-)
-def test_error_in_a_method_of_a_learner_is_named(method, message, tmp_path):
-    assert_refused(
-        type("Invalid", (ZeroLearner,), {method: lambda *_, **__: 1 / 0}), message, tmp_path / "run", episodes=1
-    )
