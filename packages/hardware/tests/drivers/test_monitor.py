@@ -348,6 +348,16 @@ def test_monitor_sends_heartbeats_before_the_first_status(arm):
     assert (len(bus.heartbeats), bus.monitor.fault, bus.commands) == (1, Fault.NO_STATUS, [])
 
 
+def test_monitor_checks_once_per_period_without_statuses(arm):
+    bus = Bus(arm)
+    bus.advance(1)
+    bus.monitor.receive()
+    bus.settle()
+    assert len(bus.heartbeats) == 1
+    bus.advance(1, status=False)
+    assert len(bus.heartbeats) == 2
+
+
 class ClockedMonitor:
     """Monitor without a robot, with a clock that tests set; one command at `commanded_at` [s] turns joint 4."""
 
