@@ -84,13 +84,6 @@ def test_output_moves_in_a_straight_line_within_speed_limit():
     np.testing.assert_allclose(deviations, 0.0, atol=1e-12)
 
 
-def test_angles_change_in_the_shorter_direction():
-    rig = Rig(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
-    rig.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
-    poses = rig.start_blending().advance(4)
-    np.testing.assert_array_equal(poses[-1][3:], [-3.1, 0.0, 0.0])
-
-
 def test_pose_within_the_speed_limits_is_output_unchanged():
     rig = Rig(MEASURED).start_blending()
     rig.advance()
