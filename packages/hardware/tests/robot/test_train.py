@@ -520,8 +520,13 @@ def inserted():
 def test_push_distinguishes_inserted_and_loose_workpieces(env, inserted, monkeypatch):
     monkeypatch.setattr("guiderail_hardware.robot.robot_env.HOLD_STEPS", 15)  # a faster push
     pull, side = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
-    for robot_env, direction, holds in ((env, pull, False), (inserted, pull, True), (inserted, side, True)):
-        test = HoldTest(tuple(HOLD_DISTANCE * np.array(direction)), MAX_HOLD_MOTION)
+    for robot_env, direction, max_motion, holds in (
+        (env, pull, 1.0, False),  # for want of a force
+        (inserted, pull, MAX_HOLD_MOTION, True),
+        (inserted, side, MAX_HOLD_MOTION, True),
+        (inserted, side, -1.0, False),  # because of the motion
+    ):
+        test = HoldTest(tuple(HOLD_DISTANCE * np.array(direction)), max_motion)
         monkeypatch.setattr(robot_env, "_hold_tests", lambda pose, test=test: [test])
         robot_env._retry_until_ok(robot_env._take_control)
         before = robot_env.pose
