@@ -106,7 +106,7 @@ def test_certify_skill_refuses_invalid_arguments(arguments, message, tmp_path):
 )
 def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, clipped_seeds):
     """Robot and history of sKGRL begin with an offset from the demonstrations."""
-    monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 10_000)
+    monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 3_000)
     environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
     result = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert result["checker"] == "yes"
