@@ -455,12 +455,6 @@ def test_center_of_a_payload_is_relative_to_the_tool_center():
     assert not np.allclose(law["generalized_force"], first, atol=0.1)
 
 
-@pytest.mark.parametrize("arguments", [(-1.0,), (np.inf,), (1.0, (0.0, 0.0)), (1.0, (np.nan, 0.0, 0.0))])
-def test_payload_is_refused_when_out_of_range(arguments):
-    with pytest.raises(InputError, match="payload"):
-        Payload(*arguments)
-
-
 def test_gains_are_copies_that_cannot_be_written_to():
     limits, posture = [10.0] * 6, np.zeros(7)
     gains = ImpedanceGains(np.eye(6), limits, posture)
