@@ -65,7 +65,7 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return the task folder of a square peg, the part of `learn_parts.py` that is simulated fastest."""
+    """Return the task folder of a square peg, the drawn part that is simulated fastest."""
     parent = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(parent)
     with pytest.MonkeyPatch.context() as patch:
