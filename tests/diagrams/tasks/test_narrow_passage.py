@@ -68,7 +68,7 @@ def test_environment_passes_the_checkers_without_a_warning(guidance, options, mo
         warnings.simplefilter("always")
         env = make(guidance, **options)
         gymnasium_check(env, skip_render_check=not options)
-        sb3_check(env, warn=True, skip_render_check=not options)
+        sb3_check(env, warn=True)
     assert not [str(warning.message) for warning in warned]
 
 
