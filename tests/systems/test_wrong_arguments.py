@@ -81,6 +81,8 @@ BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 2.5e4)
 OPENING = {"lower": np.array([0.0, -1.0]), "upper": np.array([0.04, 1.0]), "opening": np.array([0.03, 0.5])}
 EIGHT = {"bound": np.zeros(8), "max_rate": np.full(8, 1e-3), "period": PERIOD}
 GOVERNOR = {"stiffness": np.full(6, 30.0), "damping": np.ones(6), "mass": 0.01, "step": PERIOD, "bound": BOUND}
+TANK = {"stiffness": np.ones(6), "damping": np.ones(6), "bound": BOUND, "capacity": 1.0, "period": PERIOD}
+FREE_GAINS = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
 # Valid arguments of a constructor, and values out of range of single arguments with a word of the error.
 CONTACT = {"min_force": 0.5, "period": PERIOD, "time_constant": 1.0}
 RULE = (0.1, 0.1)  # tolerances of lengths and angles
@@ -117,6 +119,25 @@ OUT_OF_RANGE = [
         ((0.0, 0.1), (0.1, np.nan), (0.1,)),
         "tolerance",
     ),
+    (systems.EnergyTank, TANK, "stiffness", (np.zeros(6),), "six positive stiffnesses"),
+    (systems.EnergyTank, TANK, "capacity", (0.0, np.inf), "capacity must be positive and finite"),
+    (systems.EnergyTank, TANK, "bound", (WrenchBound(np.r_[np.inf, np.ones(5)], 20.0, 5.2),), "finite limits"),
+    (systems.EnergyTank, TANK, "period", (0.0,), "period must be positive"),
+    (systems.ImpedanceGains, FREE_GAINS, "stiffness", (np.eye(3), np.eye(6) + np.eye(6, k=1)), ""),
+    *(
+        (systems.ImpedanceGains, FREE_GAINS, "stiffness", (np.diag([*5 * [1.0], last]), np.diag([last] * 6)), "")
+        for last in (-1.0, 0.0, 1.0005e8, 1e300, np.inf, np.nan)
+    ),
+    *(
+        (systems.ImpedanceGains, FREE_GAINS, "stiffness", (np.where(np.eye(6) > 0.0, 1.0, entry),), "")
+        for entry in (-1e300, -np.inf, np.inf, -1.0)
+    ),
+    (systems.ImpedanceGains, FREE_GAINS, "wrench_limits", (np.zeros(6), np.full(6, np.nan), np.ones(5)), ""),
+    (systems.ImpedanceGains, FREE_GAINS, "wrench_limits", (np.array([1.0, 1, 1, 1, 1, 0]),), ""),
+    (systems.ImpedanceGains, FREE_GAINS, "damping_ratio", (0.0, np.inf, np.nan), ""),
+    (systems.ImpedanceGains, FREE_GAINS, "posture_stiffness", (-1.0, np.inf, np.nan), ""),
+    (systems.ImpedanceGains, FREE_GAINS, "posture_damping", (-1.0, np.inf, np.nan), ""),
+    (systems.ImpedanceGains, FREE_GAINS, "posture", (np.full(7, np.nan), np.array([0.0] * 6 + [np.inf])), ""),
     (Payload, {"mass": 1.0}, "mass", (-1.0, np.inf), "payload"),
     (Payload, {"mass": 1.0}, "center", ((0.0, 0.0), (np.nan, 0.0, 0.0)), "payload"),
 ]
