@@ -286,16 +286,11 @@ def test_station_raises_when_surfaces_are_missing():
         MujocoStation(WorkcellWithoutSurfaces())
 
 
-def test_station_raises_when_mujoco_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r'pip install "guiderail\[mujoco\]"'):
-        MujocoStation(CONNECTOR)
-
-
-def test_station_raises_when_pybullet_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(InputError, match=r'pip install "guiderail\[pybullet\]"'):
-        BulletStation(CONNECTOR)
+@pytest.mark.parametrize(("station", "engine"), [(MujocoStation, "mujoco"), (BulletStation, "pybullet")])
+def test_station_raises_when_its_engine_is_missing(station, engine, monkeypatch):
+    monkeypatch.setitem(sys.modules, engine, None)
+    with pytest.raises(InputError, match=rf'pip install "guiderail\[{engine}\]"'):
+        station(CONNECTOR)
 
 
 def test_engine_step_is_rounded_to_a_fraction_of_the_time_step():
