@@ -83,11 +83,15 @@ def find_plugins(kind: str) -> Iterator[tuple[str, metadata.EntryPoint]]:
 
     The entry points of this package belong to no distribution.
     """
-    built_in = [metadata.EntryPoint(name, target, GROUP) for name, target in BUILT_IN.items()]
-    for point in (*built_in, *metadata.entry_points(group=GROUP)):
+    for point in _all_plugins():
         prefix, _, name = point.name.partition(":")
         if prefix == kind and name:
             yield name, point
+
+
+def _all_plugins() -> Iterator[metadata.EntryPoint]:
+    yield from (metadata.EntryPoint(name, target, GROUP) for name, target in BUILT_IN.items())
+    yield from metadata.entry_points(group=GROUP)  # reads a file of each distribution, so only if it is needed
 
 
 def load_plugin(kind: str, name: str, sibling: str) -> Any:

@@ -66,12 +66,6 @@ def test_lost_command_is_replaced_by_the_last_delivered_one():
     assert not np.array_equal(delivered_commands(400, loss_probability=0.3, seed=2), outputs)
 
 
-@pytest.mark.parametrize("arguments", [{"loss_probability": 1.0}, {"loss_probability": -0.1}])
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    with pytest.raises(InputError):
-        CommandDisturbance(**{"size": 1, "period": PERIOD} | arguments)
-
-
 def test_losses_depend_on_seed_and_step_and_repeat_after_reset():
     system = CommandDisturbance(1, PERIOD, loss_probability=0.4)
     simulator = Simulator(system)

@@ -82,19 +82,6 @@ def test_last_command_is_repeated_when_desired_is_not_finite(keep_out, desired):
         assert is_changed
 
 
-@pytest.mark.parametrize("decay", [0.0, -0.1, 1.1, np.nan])
-def test_barrier_refuses_a_decay_out_of_range(decay):
-    with pytest.raises(InputError, match="fraction"):
-        BarrierFilter(KEEP_OUT, decay)
-    assert BarrierFilter(KEEP_OUT, 1.0).num_outputs == 2
-
-
-@pytest.mark.parametrize("width", [0.0, -1.0, np.inf])
-def test_tangent_space_refuses_a_width_out_of_range(width):
-    with pytest.raises(InputError, match="positive"):
-        TangentSpaceFilter(KEEP_OUT, width)
-
-
 def test_system_filters_from_measured_pose_then_last_command():
     system = CommandFilter(LAWS["barrier"], PERIOD)
     simulator = Simulator(system)

@@ -190,11 +190,3 @@ def test_age_is_relative_to_the_start_before_the_first_check(age, command_timed_
     rig.command(FIRST, time=start - age)
     rig.simulator.Initialize()
     rig.check(START if command_timed_out else FIRST, command_timed_out)
-
-
-@pytest.mark.parametrize(
-    "arguments", [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1), (np.inf, 0.1), (0.01, np.nan), (0.01, np.inf)]
-)
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    with pytest.raises(InputError):
-        CommandWatchdog(*arguments)

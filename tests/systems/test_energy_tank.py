@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems import EnergyTank
 
@@ -186,20 +185,3 @@ def test_energy_is_constant_while_measured_pose_is_not_finite():
     reference, wrench, energy = tank.step(repeated, np.r_[0.01, np.zeros(5)], 0.5 * BOUND.numbers)
     assert np.isfinite([*reference, *wrench]).all()
     assert energy == pytest.approx(before)  # the displacement without a measurement does not count as dissipation
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
-        ({"capacity": 0.0}, "capacity must be positive"),
-        ({"capacity": np.inf}, "capacity must be positive and finite"),
-        ({"bound": WrenchBound(np.r_[np.inf, np.ones(5)], 20.0, 5.2)}, "finite limits"),
-        ({"period": 0.0}, "period must be positive"),
-    ],
-)
-def test_tank_raises_when_an_argument_is_invalid(change, words):
-    arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "bound": BOUND, "capacity": 1.0, "period": 0.01} | change
-    stiffness, damping, bound = (arguments.pop(name) for name in ("stiffness", "damping", "bound"))
-    with pytest.raises(InputError, match=words):
-        EnergyTank(stiffness, damping, bound, **arguments)

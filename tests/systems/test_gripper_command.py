@@ -70,15 +70,6 @@ def test_reset_restores_the_initial_opening(is_initialized):
     np.testing.assert_array_equal(rig.desired, [0.03, 0.5, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(
-    "arguments", [{"opening": np.array([0.05, 0.0])}, {"opening": np.array([np.nan, 0.0])}, {"period": 0.0}]
-)
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | arguments
-    with pytest.raises(InputError):
-        GripperCommand(valid.pop("lower"), valid.pop("upper"), valid.pop("opening"), **valid)
-
-
 @pytest.mark.parametrize(("limit", "outside"), [(LOWER, -np.inf), (UPPER, np.inf)])
 @pytest.mark.parametrize("joint", [0, 1])
 def test_opening_may_be_at_a_limit_but_not_beyond(limit, outside, joint):

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import ContactPointMean
 from guiderail.systems.wrench_signals import MeanContactPoint
 
@@ -66,11 +65,3 @@ def test_samples_that_are_not_finite_are_skipped(place, value):
     mean.add(*broken)
     assert mean.count == 1.0
     np.testing.assert_allclose(mean.mean, [0.001, 0.002])
-
-
-@pytest.mark.parametrize(
-    ("min_force", "time_constant"), [(0.0, 1.0), (np.nan, 1.0), (0.5, 0.01), (0.5, np.inf), (0.5, np.nan)]
-)
-def test_constructor_refuses_arguments_out_of_range(min_force, time_constant):
-    with pytest.raises(InputError):
-        MeanContactPoint(min_force, period=PERIOD, time_constant=time_constant)

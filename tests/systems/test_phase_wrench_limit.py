@@ -119,24 +119,3 @@ def test_limit_that_nothing_reads_is_refused():
     rig = Rig()
     with pytest.raises(InputError, match="connect its output phase_max_wrench to the controller's input max_wrench"):
         rig.simulator.AdvanceTo(2.5 * PERIOD)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"bound": np.full(8, np.nan)}, "eight finite bounds"),
-        ({"bound": np.full(8, -1e-9)}, "eight finite bounds"),
-        ({"bound": [0.0] * 7 + [np.inf]}, "eight finite bounds"),
-        ({"bound": [-1e-9] + [0.0] * 7}, "eight finite bounds"),
-        ({"max_rate": np.r_[np.ones(7), 0.0]}, "eight finite bounds"),
-        ({"max_rate": np.r_[np.nan, np.ones(7)]}, "eight finite bounds"),
-        ({"max_rate": np.full(8, np.inf)}, "eight finite bounds"),
-        ({"period": 0.0}, "period must be positive"),
-    ],
-)
-def test_constructor_refuses_arguments_out_of_range(change, words):
-    arguments = {"bound": np.zeros(8), "max_rate": RATE, "period": PERIOD}
-    PhaseWrenchLimit(**arguments)
-    PhaseWrenchLimit(**arguments | {"max_rate": np.full(8, 1e-3)})
-    with pytest.raises(InputError, match=words):
-        PhaseWrenchLimit(**arguments | change)

@@ -16,7 +16,13 @@ from fork_server import Forks
 
 PACKAGE = Path(__file__).parent / "peglab"
 MAX_LINES = 180
-PRELOADED = [f"guiderail.tools.{name}" for name in ("cli.main", "learning.train", "evaluation.evaluate", "catalog")]
+PRELOADED = [
+    *(f"guiderail.tools.{name}" for name in ("cli.commands", "learning.trainer", "evaluation.evaluate", "catalog")),
+    *(
+        f"guiderail.{name}"
+        for name in ("diagrams.envs.make", "diagrams.guidance.primitive", "diagrams.tasks.narrow_passage")
+    ),
+]
 
 
 @pytest.fixture(scope="module")

@@ -14,22 +14,75 @@ from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.files import (
     LOCK,
     atomic_folder,
+    check_new,
     check_page,
     check_picture,
     check_writable,
+    path_exists,
     refuse_existing_run,
     remove_partial_files,
 )
 from guiderail.tools.learning.run_folder import RunFolder
 
 
-def test_check_refuses_a_path_below_a_file(tmp_path):
+@pytest.mark.parametrize("name", ["file/x.png", "file/a/b/x.png"])
+def test_path_below_a_file_is_refused(name, tmp_path):
     (tmp_path / "file").touch()
-    for name in ("file/x.png", "file/a/b/x.png"):
-        with pytest.raises(InputError, match="cannot be written"):
-            check_picture(tmp_path / name)
+    path = tmp_path / name
+    for refuse in (
+        lambda: check_picture(path),
+        lambda: check_new(path, "folder"),
+        lambda: atomic_folder(path).__enter__(),
+        lambda: evaluate(tmp_path / "none", save=path.with_suffix(".npz")),  # before the run is read
+    ):
+        with pytest.raises(InputError, match=r"cannot be written"):
+            refuse()
+
+
+def test_missing_parent_folders_are_accepted_and_not_made(tmp_path):
     check_writable(tmp_path / "new" / "folder" / "x.png")
-    assert not (tmp_path / "new").exists()
+    check_new(tmp_path / "new" / "deep" / "file.npz", "file")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_check_new_refuses_an_existing_file(tmp_path):
+    (tmp_path / "file.npz").touch()
+    with pytest.raises(InputError, match="already exists: name another file"):
+        check_new(tmp_path / "file.npz", "file")
+
+
+def test_path_exists_refuses_a_name_that_is_too_long(tmp_path):
+    with pytest.raises(InputError, match="File name too long"):
+        path_exists(tmp_path / ("x" * 300))
+
+
+def fail_while_writing(folder, error):
+    """Raise an error after half of the folder is written."""
+    with atomic_folder(folder) as part:
+        (part / "half").write_text("half")
+        raise error
+
+
+def test_atomic_folder_exists_only_when_complete(tmp_path):
+    with pytest.raises(OverflowError):
+        fail_while_writing(tmp_path / "folder", OverflowError())
+    assert list(tmp_path.iterdir()) == []
+    with atomic_folder(tmp_path / "folder") as part:
+        (part / "all").write_text("all")
+        assert not (tmp_path / "folder").exists()
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["folder", "folder/all"]
+
+
+def test_atomic_folder_keeps_the_error_of_another_file(tmp_path):
+    with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "folder"):
+        (tmp_path / "input.obj").read_bytes()
+    assert not list(tmp_path.iterdir())
+
+
+def test_atomic_folder_leaves_nothing_when_the_disk_is_full(tmp_path):
+    with pytest.raises(InputError, match="No space left"):
+        fail_while_writing(tmp_path / "folder", OSError(28, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("path", ["", "."])

@@ -138,12 +138,3 @@ def test_window_is_refused_when_it_does_not_fit_the_primitive():
         window = np.zeros((5, 2)), np.tile(covariance, (5, 1, 1))
         with pytest.raises(InputError, match="positive definite"):
             primitive.predict_window(0, *window)
-
-
-@pytest.mark.parametrize("history", [0, 3])
-def test_predict_window_equals_predict_for_the_reference(history):
-    primitive = LcNsKmp(reference(), horizon=HORIZON, history=history, lambda_=1e-3, beta=1e-3)
-    means, covariances = reference().means[3 : 4 + HORIZON], reference().covariances[3 : 4 + HORIZON]
-    action, last_outputs = np.array([0.1, -0.2]), reference().means[3 - history : 3] if history else None
-    expected = primitive.predict(3, action, last_outputs).output
-    assert (primitive.predict_window(3, means, covariances, action, last_outputs).output == expected).all()

@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
-from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
+from oracles.connector import insert_and_lock
 
 pytest.importorskip("pybullet")
 from guiderail_mujoco.bullet import MAX_STEP, STEP, BulletStation

@@ -110,31 +110,6 @@ def test_bounds_are_refused_when_invalid(bounds, message):
         validate_options(Bounds, bounds, "here")
 
 
-def test_invalid_task_is_refused_with_the_name_of_its_file(tmp_path):
-    folder = write(tmp_path / "crossed", bounds={"lower": [0.002, *[None] * 5], "upper": [0.001, *[None] * 5]})
-    with pytest.raises(InputError, match=r"crossed/task\.yaml is invalid: bounds cannot be .*: no lower bound may"):
-        read_task_file(folder)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -0.004}},
-            "motion.push must be at least 0, not -0.004",
-        ),
-        ({"motion": {"first_contact": 0.01}}, "motion.travel is missing"),
-        ({"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}}, "motion has no option 'pusch'.*push"),
-        ({"plug": part("plug", pieces=[{"file": "plug.obj", "modulus": -1.0}])}, r"plug\.pieces\[0\]\.modulus must be"),
-        ({"plug": part("plug", center="middle")}, "plug.center must be 3 numbers, such as .*, not 'middle'"),
-        ({"place": [0.5]}, r"place must be 3 numbers, such as 0.55,0,0.15, not \[0.5\]"),
-    ],
-)
-def test_message_names_the_path_of_an_invalid_option(changes, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        read_task_file(write(tmp_path / "wrong", **changes))
-
-
 @pytest.mark.parametrize(
     ("options", "remedy"),
     [
@@ -372,6 +347,14 @@ FREE = [None] * 6  # no bound on any output
         ),
         ({"recommended": {"learner": {"algoritm": "tqc"}}}, "there is no key 'algoritm': did you mean algorithm"),
         ({"recommended": {"learner": {"algorithm": 3}}}, r"recommended\.learner cannot .*: algorithm must be a name"),
+        (
+            {"bounds": {"lower": [0.002, *FREE[1:]], "upper": [0.001, *FREE[1:]]}},
+            r"edited/task\.yaml is invalid: bounds cannot be .*: no lower bound may",
+        ),
+        ({"motion": {"first_contact": 0.01}}, r"motion\.travel is missing"),
+        ({"plug": part("plug", pieces=[{"file": "plug.obj", "modulus": -1.0}])}, r"plug\.pieces\[0\]\.modulus must be"),
+        ({"plug": part("plug", center="middle")}, r"plug\.center must be 3 numbers, such as .*, not 'middle'"),
+        ({"place": [0.5]}, r"place must be 3 numbers, such as 0.55,0,0.15, not \[0.5\]"),
         ({"measured": {"clearance_mm": "abc"}}, "clearance_mm must be a number from 0 to 500, or null"),
         ({"measured": {"clearance_mm": -5}}, "clearance_mm must be a number from 0 to 500, or null"),
         ({"measured": {"clearance_mm": 10**400}}, "clearance_mm must be a number from 0 to 500, or null"),

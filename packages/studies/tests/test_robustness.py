@@ -24,11 +24,14 @@ WALL = Axis("wall", "wall [m]", (-0.5, 1.0), 1.0, lambda environment, value: {"w
 
 @pytest.fixture
 def run(bead_run, monkeypatch):
+    """Return a run whose robustness is evaluated on one axis, without pictures, which take most of the time."""
     monkeypatch.setattr(module, "AXES", (WALL,))
+    monkeypatch.setattr(module, "draw", lambda path, rows: path.touch() or path)
     return bead_run
 
 
-def test_robustness_evaluates_each_point_once(run, capsys):
+def test_robustness_evaluates_each_point_once(run, capsys, monkeypatch):
+    monkeypatch.setattr(module, "draw", draw)
     options = {"episodes": 3, "baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}}
     first = robustness([run], **options)
     assert {row["policy"] for row in first["rows"]} == {"policy", "demonstration", "uniform_random"}
@@ -215,6 +218,7 @@ def test_all_policies_are_evaluated_at_the_same_offsets(bead_config, tmp_path, m
 
     (axis,) = select_axes("offsets")
     monkeypatch.setattr(module, "find_subject", find)
+    monkeypatch.setattr(module, "is_demonstrated", lambda guidance: False)
     monkeypatch.setattr(module, "AXES", (replace(axis, values=(2.0,)),))
     baselines = {"uniform_random": recording_policy("uniform_random")}
     robustness([tmp_path], episodes=2, baselines=baselines, out=tmp_path, processes=1)

@@ -3,7 +3,6 @@ import itertools
 import numpy as np
 import pytest
 
-from guiderail.tools.evaluation.metrics import wilson
 from guiderail_studies.run_statistics import bootstrap_band, interquartile_mean, median_survival, survival
 
 
@@ -53,9 +52,3 @@ def test_survival_censors_runs_that_never_converged():
 def test_median_survival_includes_a_half_despite_rounding(converged):
     runs = [*range(1, converged + 1), *[None] * (24 - converged)]
     assert median_survival(*survival(runs, [100] * 24)) == 12
-
-
-def test_wilson_interval_of_all_successes_has_a_lower_end():
-    low, high = wilson(100, 100)
-    assert low == pytest.approx(0.963, abs=1e-3)
-    assert high == 1.0

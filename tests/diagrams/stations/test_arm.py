@@ -18,9 +18,9 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.models.robots.robot import find_robot
 from guiderail.systems.support.drake_multibody import pose_to_transform
+from oracles.connector import insert_and_lock
 
 WORKCELL = BncWorkcell()
 ROBOTS = ("iiwa14", "panda", "ur5e")

@@ -34,11 +34,11 @@ def new_run():
     RUN.clear()
 
 
-def play(env, policy, *, seed=None, options=None):
-    """Run an episode; return the last info, the return, and all observations."""
+def play(env, policy, *, seed=None, options=None, steps=np.inf):
+    """Run an episode or its first control steps; return the last info, the return, and all observations."""
     observation, _ = env.reset(seed=seed, options=options)
     observations, total, finished, info = [observation], 0.0, False, {}
-    while not finished:
+    while not finished and len(env.trace) < steps:
         observation, reward, terminated, truncated, info = env.step(policy(observation))
         observations.append(observation)
         total += reward
@@ -95,10 +95,10 @@ def safe_residual():
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_commands_satisfy_the_constraint_under_any_action(guidance, request):
-    """Random corners of the square of actions, which change at every step."""
+    """Random corners of the square of actions, which change at every step, for 5 s: approach, search and insertion."""
     env = request.getfixturevalue(guidance)
     rng = np.random.default_rng(3)
-    info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
+    info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5, steps=250)
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert np.abs(env.trace.commanded[:, :2]).max() <= ALIGNMENT + 1e-9
     assert np.isfinite(observations).all()

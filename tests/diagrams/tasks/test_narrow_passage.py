@@ -58,22 +58,16 @@ def adversaries():
         yield lambda k: rng.choice([-1.0, 1.0], 2).astype(np.float32)
 
 
-@pytest.mark.parametrize("guidance", GUIDANCE)
-def test_environment_passes_the_checkers_without_a_warning(guidance):
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        env = make(guidance)
-        gymnasium_check(env, skip_render_check=True)
-        sb3_check(env, warn=True, skip_render_check=True)
-    assert not [str(warning.message) for warning in warned]
-
-
-def test_environment_with_images_passes_the_checkers(monkeypatch):
+@pytest.mark.parametrize(
+    ("guidance", "options"),
+    [("skgrl", {}), ("residual", {}), ("kgrl", {"observation": "image", "render_mode": "rgb_array"})],
+)
+def test_environment_passes_the_checkers_without_a_warning(guidance, options, monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")  # Gymnasium's checker also makes render_mode="human"
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        env = make("kgrl", observation="image", render_mode="rgb_array")
-        gymnasium_check(env)
+        env = make(guidance, **options)
+        gymnasium_check(env, skip_render_check=not options)
         sb3_check(env, warn=True)
     assert not [str(warning.message) for warning in warned]
 

@@ -24,14 +24,6 @@ REGISTRIES = {
 OPTIONS = {"station_options": (STATIONS, "options"), "learner_config": (LEARNERS, "Config")}
 
 
-@pytest.mark.parametrize("name", [{}, [], None, 3, ["sphere"]])
-def test_get_refuses_names_that_are_not_text(name):
-    shapes = Registry("shape")
-    shapes.register("sphere", object())
-    with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
-        shapes.get(name)
-
-
 @pytest.mark.parametrize(
     ("entry", "sibling"), [(name, sibling) for sibling, names in SIBLINGS.items() for name in names if ":" in name]
 )
@@ -59,11 +51,18 @@ def test_register_refuses_names_that_are_not_text(name):
     assert shapes.names() == []
 
 
-def test_get_suggests_the_closest_name_when_a_name_is_unknown():
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("spere", "there is no shape 'spere': did you mean sphere"),
+        *((name, "a shape is named by a word, not .*: choose one of sphere") for name in ({}, [], None, 3, ["sphere"])),
+    ],
+)
+def test_get_refuses_unknown_names_and_suggests_one(name, message):
     shapes = Registry("shape")
     shapes.register("sphere", object())
-    with pytest.raises(InputError, match="there is no shape 'spere': did you mean sphere"):
-        shapes.get("spere")
+    with pytest.raises(InputError, match=message):
+        shapes.get(name)
 
 
 def test_get_refuses_all_names_when_no_entry_is_registered():

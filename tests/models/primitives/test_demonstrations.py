@@ -90,32 +90,6 @@ def test_constructor_refuses_invalid_names(names):
         Demonstrations([[0.0, 1.0]], [[[1.0], [2.0]]], names)
 
 
-def test_load_refuses_damaged_and_dangerous_files(tmp_path):
-    with pytest.raises(InputError, match="no demonstration file"):
-        Demonstrations.load(tmp_path / "missing.npz")
-    good = tmp_path / "good.npz"
-    wavy().save(good)
-    truncated = tmp_path / "truncated.npz"
-    truncated.write_bytes(good.read_bytes()[:200])
-    with pytest.raises(InputError, match="damaged"):
-        Demonstrations.load(truncated)
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, times=np.array([0.0, 1.0]), outputs=np.array([[[object()]] * 2], dtype=object))
-    with pytest.raises(InputError, match="damaged"):
-        Demonstrations.load(pickled)
-    inconsistent = tmp_path / "inconsistent.npz"
-    np.savez(inconsistent, lengths=[5], times=np.arange(4.0), outputs=np.ones((4, 1)))
-    with pytest.raises(InputError, match="add up"):
-        Demonstrations.load(inconsistent)
-    ragged = tmp_path / "ragged.csv"
-    ragged.write_text("demonstration,time,x\n0,0,1\n0,1\n")
-    with pytest.raises(InputError, match="line 3"):
-        Demonstrations.load(ragged)
-    (tmp_path / "d.txt").write_text("")
-    with pytest.raises(InputError, match="ending"):
-        Demonstrations.load(tmp_path / "d.txt")
-
-
 def make_demonstrations():
     t = np.linspace(0.0, 2.0, 101)
     return Demonstrations(t, [np.column_stack([a * t, np.sin(3 * t) + a]) for a in (0.9, 1.0, 1.1)])

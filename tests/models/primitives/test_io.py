@@ -167,10 +167,9 @@ def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
     twice.write_bytes(twice.read_bytes().replace(b"outputs_npy", b"outputs.npy"))
     assert "two arrays" in load_error(twice)
 
-    (tmp_path / "empty.npz").write_bytes(b"")
-    assert "damaged" in load_error(tmp_path / "empty.npz")
-    (tmp_path / "text.npz").write_text("demonstration,time,x\n")
-    assert "damaged" in load_error(tmp_path / "text.npz")
+    for content in (b"", b"demonstration,time,x\n", good[:200]):
+        (tmp_path / "damaged.npz").write_bytes(content)
+        assert "damaged" in load_error(tmp_path / "damaged.npz")
 
 
 def test_npz_reader_detects_a_flipped_bit_anywhere(tmp_path):
@@ -290,6 +289,9 @@ def test_read_refuses_pipes_and_devices(tmp_path):
     assert "no demonstration file" in load_error(tmp_path / "pipe.csv")
     os.symlink("/dev/zero", tmp_path / "zero.npz")
     assert "no demonstration file" in load_error(tmp_path / "zero.npz")
+    assert "no demonstration file" in load_error(tmp_path / "missing.npz")
+    (tmp_path / "d.txt").touch()
+    assert "ending" in load_error(tmp_path / "d.txt")
     with pytest.raises(InputError):
         Demonstrations.load("x" * 5000 + ".npz")
     with pytest.raises(InputError):

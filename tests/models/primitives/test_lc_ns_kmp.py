@@ -468,11 +468,6 @@ def test_unused_primitive_is_released():
     assert not [primitive for primitive in _SHARED.values() if primitive.reference.means[-1, 1] == 1.7]
 
 
-def test_shared_primitive_refuses_invalid_arguments():
-    with pytest.raises(InputError, match="lambda_"):
-        get_shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)
-
-
 def test_predict_accepts_lists_and_whole_numbers_of_any_type():
     primitive = LcNsKmp(**small(history=2))
     past = np.zeros((2, 2))

@@ -258,6 +258,14 @@ def test_nearest_turn_is_within_half_a_turn_of_the_center(center):
         (lambda: ac.KeepAbove(0.0, points_m=((0.0, math.nan, 0.0),)), "points_m must be finite"),
         (lambda: ac.Funnel(F, 0.1, math.nan, 1.0), "height_m must be finite"),
         (lambda: ac.Funnel(F, 0.1, 0.0, math.inf), "slope must be finite"),
+        (lambda: ac.OutsideSphere(radius_m=0.0), "radius_m must be positive"),
+        (lambda: ac.OutsideSphere(radius_m=0.1, center_m=(0.0, 0.0)), "center_m must be three"),
+        (lambda: ac.OutsideCylinder(frame=F, radius_m=0.0, min_m=0.0, max_m=1.0), "radius_m must be positive"),
+        (lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=1.0, max_m=1.0), "min_m must be less"),
+        (lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=0.0, max_m=1.0, margin_m=-0.1), "margin_m must not"),
+        (lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 0.0, 1.0)), "lower_m must be less"),
+        (lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 1.0, 1.0), margin_m=-0.1), "margin_m must not"),
+        (lambda: ac.InsideSphere(radius_m=-0.1), "radius_m must be positive"),
     ],
 )
 def test_constraint_refuses_invalid_arguments(make, message):

@@ -2,12 +2,14 @@
 
 import io
 import sys
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from guiderail.tools.learning.learner_config import LEARNERS
+from guiderail.tools.tables import read_table
 from guiderail_studies.declaration import load_study
 from research.results.methods import (
     README_COLUMNS,
@@ -34,24 +36,30 @@ def rows(text):
     return [row for row in cells if row[0] not in ("method", "task")]
 
 
-@pytest.mark.parametrize(
-    ("page", "arguments"), [("README.md", (README_COLUMNS, README_TITLES)), ("docs/results.md", ())]
-)
-def test_page_has_the_table_of_the_stored_results(page, arguments):
-    text = (ROOT / page).read_text(encoding="utf-8")
-    assert replace_table(text, hard_tasks_table(TABLES, *arguments)) == text, (
-        f"{page} is stale: python -m research.results"
-    )
+@pytest.fixture(scope="module")
+def hard_tasks():
+    """Return the table of the hard tasks of the stored results, which takes most of a second."""
+    return hard_tasks_table(TABLES)
 
 
-def test_hard_tasks_table_has_at_most_ten_rows_of_hard_tasks():
-    titles = [row[0] for row in rows(hard_tasks_table(TABLES))]
+def test_pages_have_the_table_of_the_stored_results(hard_tasks):
+    for page, table in (
+        ("README.md", hard_tasks_table(TABLES, README_COLUMNS, README_TITLES)),
+        ("docs/results.md", hard_tasks),
+    ):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        assert replace_table(text, table) == text, f"{page} is stale: python -m research.results"
+
+
+def test_hard_tasks_table_has_at_most_ten_rows_of_hard_tasks(hard_tasks):
+    titles = [row[0] for row in rows(hard_tasks)]
     assert 4 <= len(titles) <= 10
     assert all("hard" in title for title in titles)
 
 
 def test_pages_have_the_stored_results(tmp_path, monkeypatch):
     monkeypatch.setattr("research.results.page.draw_sweeps", lambda *_: None)  # tested in test_page.py
+    monkeypatch.setattr("research.results.methods.read_table", cache(read_table))  # each table has many rows of pages
     for page in write_pages(TABLES, tmp_path):
         stored = PAGES_FOLDER / page.name
         assert page.read_text() == stored.read_text(), f"{stored} is stale: python -m research.results"
@@ -218,8 +226,8 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
     assert row[1:] == ["58 (25–100) in training"]
 
 
-def test_results_with_a_constant_offset_are_marked():
-    table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
+def test_results_with_a_constant_offset_are_marked(hard_tasks):
+    table = {row[0]: row for row in rows(hard_tasks)}
     assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
     assert table["Grid clamp, hard"][6] == "60 (10)"
     assert "†" not in "".join(table["Connector, hard, contact at 10 ms"])
@@ -238,8 +246,8 @@ def test_results_with_a_constant_offset_are_marked():
     assert offsets(SECTIONS["BncConnector"][0], TABLES) == []
 
 
-def test_spilled_episodes_count_as_stopped():
-    table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
+def test_spilled_episodes_count_as_stopped(hard_tasks):
+    table = {row[0]: row for row in rows(hard_tasks)}
     assert table["Pouring, hard"][4] == "0 / –"
     assert table["Narrow passage, hard"][4] == "36 (sKGRL), 41 (KGRL) / 63"
 

@@ -595,8 +595,9 @@ def test_demonstrations_in_another_unit_than_constraints_or_each_other_are_warne
 def test_start_at_the_demonstrations_causes_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        env = make_guided()
         for seed in range(20):
-            make_guided().reset(seed=seed)
+            env.reset(seed=seed)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

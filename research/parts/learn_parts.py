@@ -1,6 +1,6 @@
 """Benchmark of the drawn parts without tuned parameters: create their tasks, train and evaluate by the command line.
 
-Run `python packages/parts/tests/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60]
+Run `python -m research.parts.learn_parts --out FOLDER [--parts square_peg,dovetail] [--episodes 60]
 [--held-out 100] [--seed 0] [--processes 2]`. With `--episodes 0` the tasks are only created. The same command
 continues after an interruption. The results are `table.md` and a log of each part.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from oracles.parts import PARTS
 
