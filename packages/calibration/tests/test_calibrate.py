@@ -108,6 +108,11 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     assert again["parameters"] == result["parameters"]
 
 
+def test_task_without_demonstrations_from_a_file_is_not_probed(tmp_path):
+    with pytest.raises(InputError, match="GridClamp takes no demonstrations from a file"):
+        record_options("pretrained:clamp", {}, tmp_path / "probe.npz")
+
+
 def test_recordings_that_cannot_be_used_are_refused(recorded, tmp_path):
     with pytest.raises(InputError, match="has no recorded episode"):
         load_recordings(tmp_path)

@@ -63,12 +63,17 @@ def write_probe(task: str, environment: Mapping[str, Any], path: Path) -> Path:
     """Write the probing motion of a task to a file of demonstrations, .npz or .csv.
 
     Raises:
-        InputError: If the task has no rim, or the file cannot be written.
+        InputError: If the task has no rim or takes no demonstrations from a file, or the file cannot be written.
     """
     made = EnvConfig.resolve(task, dict(environment)).declared
     contact = made.rim_contact() if hasattr(made, "rim_contact") else None
     if contact is None:
         raise InputError(f"{task} has no rim to probe: calibrate from episodes of the policy, without --probe")
+    if "demonstrations" not in environment:
+        raise InputError(
+            f"{task} takes no demonstrations from a file, as a probing motion is: calibrate from episodes of the "
+            "policy, without --probe"
+        )
     probing_motion(contact.height, float(contact.turn), contact.radius).save(path)
     return path
 
