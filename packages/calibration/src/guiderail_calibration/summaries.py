@@ -32,9 +32,10 @@ def summarize_episode(episode: Episode, num_steps: int) -> np.ndarray:
     """Return the summaries of one episode.
 
     In each segment: mean tracking error and wrench, their norms in the plane and about its axes, spread of the position
-    in the plane (the play in a hole), drag and stiffness as logarithms of ratios. Between segments: change of the measured height, which a workpiece at rest on a rim does not
-    change, unless it slips in the grasp. In the whole episode: noise, correlations of the motion and of the wrench with
-    the command at several lags, first contact, largest force and length.
+    in the plane (the play in a hole), drag and stiffness as logarithms of ratios. Between segments: change of the
+    measured height, which a workpiece at rest on a rim does not change, unless it slips in the grasp. In the whole
+    episode: noise, correlations of the motion and of the wrench with the command at several lags, first contact,
+    largest force and length.
     """
     desired, pose, wrench = (np.asarray(a, float) for a in (episode.desired, episode.pose, episode.wrench))
     error = (desired - pose) / POSE_SCALE
