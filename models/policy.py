@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -229,8 +230,54 @@ class Policy:
         return np.concatenate([image.ravel(), state])
 
 
+@dataclass(frozen=True)
+class RimSearch:
+    """Lissajous figure that is added to an action while a workpiece has not entered its fixture.
+
+    Where a contact does not show the direction to a hole, a policy stands still on the rim, and the figure moves the
+    workpiece over it. It depends only on the observation.
+
+    Args:
+        time: Entry of the observation with the time, from −1 to 1 in an episode.
+        height: Entry with the height.
+        above: Value of this entry above which the workpiece is on the rim.
+        after: Fraction of the episode after which the figure is added.
+        amplitude: Amplitude in the units of an action.
+        cycles: Cycles in an episode of the action's first and second entry.
+
+    Raises:
+        ValueError: If a number is missing, not finite, or not of this kind.
+    """
+
+    time: int
+    height: int
+    above: float
+    after: float
+    amplitude: float
+    cycles: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        numbers = (self.above, self.after, self.amplitude, *self.cycles)
+        if any(type(entry) is not int or entry < 0 for entry in (self.time, self.height)) or len(self.cycles) != 2:
+            raise ValueError("a search has entries of the observation, and two numbers of cycles")
+        if not np.isfinite(np.array(numbers, float)).all():
+            raise ValueError("the numbers of a search must be finite")
+
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        """Return True if observations of a shape have the entries."""
+        return len(shape) == 1 and max(self.time, self.height) < shape[0]
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return what is added to the first two entries of the action, (2,)."""
+        passed = 0.5 * (float(observation[self.time]) + 1.0)
+        if passed < self.after or observation[self.height] <= self.above:
+            return np.zeros(2)
+        angles = 2.0 * np.pi * passed * np.array(self.cycles)
+        return self.amplitude * np.array([np.sin(angles[0]), np.cos(angles[1])])
+
+
 class Ensemble(Policy):
-    """Policy of several networks; its action is the mean of theirs.
+    """Policy of several networks; its action is the mean of theirs, with the `RimSearch` of its description, if any.
 
     Args:
         members: Policies with the same observations and limits of actions, at least one.
@@ -249,6 +296,13 @@ class Ensemble(Policy):
                 if list(member.description[name]) != list(first.description[name]):
                     raise ValueError(f"the policies of an ensemble need the same {name}")
         self.description["members"] = [member.description for member in self.members]
+        search = self.description.get("search")
+        self._search = None if search is None else RimSearch(**search)
+        self._low, self._high = first._low, first._high
+        if self._search is not None and (
+            len(self._low) < 2 or first._image_shape is not None or not self._search.fits(first._shape)
+        ):
+            raise ValueError("a search moves two entries of an action, by entries of a vector that is observed")
 
     @property
     def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -267,8 +321,12 @@ class Ensemble(Policy):
         return np.stack([member(observation) for member in self.members])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the mean of the networks' actions, (A,), for one observation."""
-        return self.actions(observation).mean(axis=0)
+        """Return the mean of the networks' actions and the search, (A,), for one observation."""
+        action = self.actions(observation).mean(axis=0)
+        if self._search is None:
+            return action
+        action[:2] += self._search(observation).astype(np.float32)
+        return np.clip(action, self._low, self._high)
 
     def disagreement(self, observation: np.ndarray) -> float:
         """Return the standard deviation of the networks' actions, mean over the entries of the action."""

@@ -108,7 +108,7 @@ def main() -> None:
     probe = write_probe(config.task, base, given.out / "probe.npz")
     parameters, _ = select_parameters(config.task, base)
     size, processes = len(parameters), given.processes
-    recorded = Simulator(config.task, {**base, **probe_options(probe)}, parameters)
+    recorded = Simulator(config.task, {**base, **probe_options(probe, base)}, parameters)
     num_steps = EnvConfig.resolve(config.task, dict(recorded.environment)).num_steps
     prior = simulate_all(recorded, given.out / "prior", draw_prior(given.draws, size), processes=processes)
     rows, covered, p_values, errors = [], [], [], []
@@ -156,7 +156,7 @@ def predictions(
     own = base if engine == "Drake" else changed_environment(subject.config.task, base, {"station": "mujoco"})
     drawn = draw_prior(number, len(recorded.parameters), seed)
     folder, processes = given.out / engine, given.processes
-    probing = replace(recorded, environment={**own, **probe_options(given.out / "probe.npz")})
+    probing = replace(recorded, environment={**own, **probe_options(given.out / "probe.npz", own)})
     robots = simulate_all(probing, folder / "recorded", drawn, seed=seed, processes=processes, label="recorded")
     policy = Simulator(subject.config.task, base, recorded.parameters, subject.make_policy, str(subject.digest))
     measured = simulate_all(

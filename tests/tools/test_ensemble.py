@@ -41,3 +41,30 @@ def test_damaged_ensembles_are_refused(tmp_path):
         file.write_text(json.dumps(values | {"members": changed}))
         with pytest.raises(InputError, match="is damaged"):
             Policy.load(tmp_path)
+
+
+SEARCH = {"time": 0, "height": 2, "above": -0.1, "after": 0.25, "amplitude": 1.5, "cycles": [4.0, 3.0]}
+
+
+def test_search_moves_a_workpiece_that_stays_on_the_rim(tmp_path):
+    members = [policy(0), policy(1)]
+    Ensemble(members, {**members[0].description, "search": SEARCH}).save(tmp_path)
+    loaded, mean = Policy.load(tmp_path), Ensemble(members)
+    for time, height, searches in ((-0.6, 0.3, False), (0.1, -0.2, False), (0.1, 0.3, True)):
+        observation = np.array([time, 0.0, height], np.float32)
+        angles = np.pi * (np.float64(np.float32(time)) + 1.0) * np.array([4.0, 3.0])
+        moved = 1.5 * np.array([np.sin(angles[0]), np.cos(angles[1])]) * searches
+        np.testing.assert_allclose(loaded(observation), np.clip(mean(observation) + moved, -1.0, 1.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"time": 3}, {"height": -1}, {"time": 0.0}, {"amplitude": float("nan")}, {"cycles": [1.0]}, {"unknown": 1},
+        {"after": "soon"},
+    ],
+)  # fmt: skip
+def test_searches_that_do_not_fit_are_refused(tmp_path, changed):
+    members = [policy(0), policy(1)]
+    with pytest.raises((ValueError, TypeError)):
+        Ensemble(members, {**members[0].description, "search": {**SEARCH, **changed}})

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.evaluate import evaluate
@@ -27,7 +28,7 @@ def recorded(tmp_path_factory):
     record_options(RUN, GANTRY, folder / "probe.npz")
     config = find_subject(RUN, None).config
     base = changed_environment(config.task, config.environment, GANTRY)
-    robot = {**base, **probe_options(folder / "probe.npz"), "disturbances.stiffness_factor": 1.7}
+    robot = {**base, **probe_options(folder / "probe.npz", base), "disturbances.stiffness_factor": 1.7}
     evaluate("zero", config.task, 2, environment=robot, baselines=(), processes=1, steps=folder / "recordings")
     return folder
 
@@ -38,11 +39,28 @@ def test_probing_motion_presses_within_the_force_limit(recorded):
     for episode in episodes:
         force = np.linalg.norm(episode.wrench[:, :3], axis=1)
         assert 3.0 < force.max() < 20.0
-        assert np.ptp(episode.pose[:, 0]) > 1e-4  # slides
+        assert np.ptp(episode.pose[25:37, 1]) > 1e-4  # slides on the rim
+
+
+def test_probing_motion_shows_the_clearance_in_the_hole(recorded):
+    config = find_subject(RUN, None).config
+    base = changed_environment(config.task, config.environment, GANTRY)
+    rim = EnvConfig.resolve(config.task, base).declared.rim_contact().height
+    environment = {**base, **probe_options(recorded / "probe.npz", base)}
+    parameters, _ = select_parameters(config.task, base, ["clearance"])
+    play = []
+    for quantile in (0.0, 1.0):
+        simulator = Simulator(config.task, environment, parameters)
+        (episode,), _ = simulator.simulate(np.array([quantile]), 5, 1)
+        assert abs(episode.pose[40, 2] - rim) < 5e-4  # stands on the rim
+        assert episode.pose[137, 2] - rim < -2e-3  # is in the hole
+        play.append(np.ptp(episode.pose[112:137, 0]))
+    assert play[0] < 5e-5
+    assert play[1] > 1e-4
 
 
 def test_summaries_tell_robots_apart_more_than_episodes(recorded):
-    a, b = (summarize([episode], 98) for episode in load_recordings(recorded / "recordings"))
+    a, b = (summarize([episode], 151) for episode in load_recordings(recorded / "recordings"))
     assert np.isfinite(a).all()
     assert a.shape == b.shape
 
@@ -90,13 +108,18 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     assert again["parameters"] == result["parameters"]
 
 
+def test_task_without_demonstrations_from_a_file_is_not_probed(tmp_path):
+    with pytest.raises(InputError, match="GridClamp takes no demonstrations from a file"):
+        record_options("pretrained:clamp", {}, tmp_path / "probe.npz")
+
+
 def test_recordings_that_cannot_be_used_are_refused(recorded, tmp_path):
     with pytest.raises(InputError, match="has no recorded episode"):
         load_recordings(tmp_path)
     with pytest.raises(InputError, match="there is no folder"):
         load_recordings(tmp_path / "missing")
     other = find_subject(RUN, None).config
-    nominal = np.zeros((98, 6))
+    nominal = np.zeros((151, 6))
     with pytest.raises(InputError, match="another motion than the probing motion"):
         load_recordings(recorded / "recordings", nominal)
     (source, *_) = sorted((recorded / "recordings").glob("*.parquet"))
@@ -115,7 +138,7 @@ def test_damaged_simulation_is_named(recorded, tmp_path):
     config = find_subject(RUN, None).config
     base = changed_environment(config.task, config.environment, GANTRY)
     parameters, _ = select_parameters(config.task, base, ["friction"])
-    simulator = Simulator(config.task, {**base, **probe_options(recorded / "probe.npz")}, parameters)
+    simulator = Simulator(config.task, {**base, **probe_options(recorded / "probe.npz", base)}, parameters)
     (tmp_path / "00000.npz").write_bytes(b"PK\x03\x04")
     with pytest.raises(InputError, match="is damaged: delete it"):
         simulate_all(simulator, tmp_path, draw_prior(1, 1), processes=1)

@@ -140,7 +140,7 @@ def calibrate(
     base = subject.changed_environment(dict(environment or {}))
     selected, left_out = select_parameters(config.task, base, parameters)
     policy = Simulator(config.task, base, selected, subject.make_policy, str(subject.digest))
-    recorded = policy if probe is None else Simulator(config.task, {**base, **probe_options(probe)}, selected)
+    recorded = policy if probe is None else Simulator(config.task, {**base, **probe_options(probe, base)}, selected)
     resolved = EnvConfig.resolve(config.task, dict(recorded.environment))
     num_steps, reference = resolved.num_steps, None if probe is None else resolved.reference()
     episodes = load_recordings(recordings, None if reference is None else reference.means)

@@ -46,7 +46,6 @@ PARAMETERS = tuple(
         ("modulus", 0.1, 10.0, "log"),
         ("stiffness", 0.5, 2.0, "log"),
         ("clearance", 0.5, 2.0, "log"),
-        ("offsets", 0.6, 1.3, "linear"),
         ("wrench_scale", 0.5, 2.0, "log"),
         ("wrench_bias", 0.0, 4.0, "linear"),
         ("wrench_noise", 0.02, 1.0, "log"),

@@ -31,10 +31,11 @@ def summarize(episodes: Sequence[Episode], num_steps: int) -> np.ndarray:
 def summarize_episode(episode: Episode, num_steps: int) -> np.ndarray:
     """Return the summaries of one episode.
 
-    In each segment: mean tracking error and wrench, their norms in the plane and about its axes, drag and stiffness as
-    logarithms of ratios. Between segments: change of the measured height, which a workpiece at rest on a rim does not
-    change, unless it slips in the grasp. In the whole episode: noise, correlations of the motion and of the wrench with
-    the command at several lags, first contact, largest force and length.
+    In each segment: mean tracking error and wrench, their norms in the plane and about its axes, spread of the position
+    in the plane (the play in a hole), drag and stiffness as logarithms of ratios. Between segments: change of the
+    measured height, which a workpiece at rest on a rim does not change, unless it slips in the grasp. In the whole
+    episode: noise, correlations of the motion and of the wrench with the command at several lags, first contact,
+    largest force and length.
     """
     desired, pose, wrench = (np.asarray(a, float) for a in (episode.desired, episode.pose, episode.wrench))
     error = (desired - pose) / POSE_SCALE
@@ -52,8 +53,9 @@ def summarize_episode(episode: Episode, num_steps: int) -> np.ndarray:
         plane_error, plane_force = (np.linalg.norm(v[at, :2], axis=1).mean() for v in (error, force))
         drag = np.log((plane_force + 1.0) / (abs(f[2]) + 1.0))
         stiffness = np.log((np.abs(f[:3]) + 1.0) / (np.abs(e[:3]) + 1.0))
-        norms = [plane_error, plane_force, np.linalg.norm(f[3:5]), drag]
-        values.append(np.concatenate([_compress(e), _compress(f), _compress(np.array(norms[:3])), [drag], stiffness]))
+        play = np.linalg.norm(pose[at, :2].std(axis=0)) / POSE_SCALE[0]
+        norms = np.array([plane_error, plane_force, np.linalg.norm(f[3:5]), 10.0 * play])
+        values.append(np.concatenate([_compress(e), _compress(f), _compress(norms), [drag], stiffness]))
     noise = [np.log(np.std(np.diff(v, n=2, axis=0), axis=0) + 1e-3) for v in (error, force)]
     speed, motion = np.diff(desired / POSE_SCALE, axis=0), np.diff(pose / POSE_SCALE, axis=0)
     lags = [_correlations(speed, motion), _correlations(np.diff(error, axis=0), np.diff(force, axis=0))]

@@ -1,7 +1,8 @@
 """Ensemble of the policies of several runs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Ensemble, Policy
@@ -11,10 +12,11 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 
 
-def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
+def write_ensemble(runs: Sequence[str | Path], out: Path, search: Mapping[str, Any] | None = None) -> Ensemble:
     """Write the mean of several runs' policies as a run folder with the configuration of the first run.
 
-    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run.
+    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run. `search` are the arguments of
+    a `RimSearch`; None for none.
     """
     if len(runs) < 2:
         raise InputError("an ensemble has the policies of several runs: name at least two")
@@ -23,7 +25,8 @@ def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
     for config in configs[1:]:
         refuse_guidance_change(configs[0].environment, config.environment)
     try:
-        ensemble = Ensemble([Policy.load(folder.path) for folder in folders])
+        members = [Policy.load(folder.path) for folder in folders]
+        ensemble = Ensemble(members, None if search is None else {**members[0].description, "search": dict(search)})
     except ValueError as error:
         if isinstance(error, InputError):
             raise
