@@ -85,6 +85,22 @@ def test_task_that_lacks_methods_is_refused_with_their_names():
         declare(of=Task, station=PlaneStation)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("reward_terms", lambda self: {}, "Task has no method 'reward_terms': did you mean rewards?"),
+        ("reward", lambda self: {}, "'reward' is an option of Declared, not a method: did you mean rewards?"),
+        ("colision", property(lambda self: None), "did you mean collision?"),
+        ("clipp", 2.0, "did you mean clip?"),
+        ("motion_constraints", lambda self: None, r"return Prior\(reference, linear, motion=\.\.\.\)"),
+    ],
+)
+def test_misspelled_method_of_a_task_is_refused(name, value, message):
+    with pytest.raises(InputError, match=message):
+        declare(**{name: value})
+    declare(**{"_" + name: value, "goal": value, "station": lambda workcell: None})
+
+
 def test_default_guidance_has_an_effect():
     declare()
     assert possible_guidance(prior_of(TASKS.get("lab/Own")).provides)[0] == "base_policy"
