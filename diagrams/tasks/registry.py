@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import gymnasium
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry, check_class, did_you_mean, load_plugin
+from guiderail.models.common.registry import Registry, check_class, check_methods, did_you_mean, load_plugin
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
@@ -75,6 +75,7 @@ def _check(name: str, task: type[Task]) -> None:
     from guiderail.diagrams.tasks.task import Task
 
     check_class(name, task, Task)
+    check_methods(task, Task)
     bases = [base for base in task.__mro__[1:] if issubclass(base, Task)]
     known = {each for base in bases for each in (*vars(base), *base.__annotations__)}
     # A method in place of an option becomes its default value.

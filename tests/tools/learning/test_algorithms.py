@@ -10,7 +10,7 @@ from random_episodes import OBSERVATION, check_learning_resumes, learn, make_lea
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import Learner, register_learner
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
 from guiderail.tools.learning.off_policy import TD3_NOISE
@@ -164,6 +164,27 @@ def test_stored_attributes_are_the_state_of_a_learner():
     assert not first.has_diverged()
     first.best[0] = np.nan
     assert first.has_diverged()
+    Stored.stored = ("best", "hihgest")
+    with pytest.raises(InputError, match="Stored has no attribute 'hihgest', which it names in stored"):
+        first.state()
     Stored.stored = None
     with pytest.raises(InputError, match="Stored names nothing in stored"):
         first.state()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"on_step": lambda self, observation, reward: None},
+            r"on_step of Wrong must have the parameters \(self, trans",
+        ),
+        (
+            {"policy": lambda self: None},
+            r"policy of Wrong must have the parameters \(self, description\), not \(self\)",
+        ),
+    ],
+)
+def test_learner_is_refused_when_a_method_lacks_parameters(attributes, message):
+    with pytest.raises(InputError, match=message):
+        register_learner("wrong")(type("Wrong", (Stored,), attributes))
