@@ -7,13 +7,14 @@ import pytest
 import torch
 from gymnasium import spaces
 from random_episodes import OBSERVATION, check_learning_resumes, learn, make_learner
+from stable_baselines3 import DDPG
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import Learner, register_learner
+from guiderail.tools.learning.learner import LEARNERS, Learner, register_learner
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
-from guiderail.tools.learning.off_policy import TD3_NOISE
+from guiderail.tools.learning.off_policy import TD3_NOISE, OffPolicyLearner
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
 ALGORITHMS = ["td3", "crossq"]
@@ -34,8 +35,10 @@ def test_exported_policy_acts_as_the_model(algorithm):
     np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
 
 
-def test_td3_explores_with_noise():
-    learner = make_learner(resolve_preset(None, "td3", OFF_POLICY))
+@pytest.mark.parametrize("algorithm", ["td3", "ddpg"])
+def test_deterministic_policy_explores_with_noise(algorithm, monkeypatch):
+    monkeypatch.setitem(LEARNERS._entries, "ddpg", type("Ddpg", (OffPolicyLearner,), {"algorithm": DDPG}))
+    learner = make_learner(resolve_preset(None, algorithm, OFF_POLICY))
     actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
     np.testing.assert_allclose(actions.std(axis=0), TD3_NOISE, atol=0.02)
     assert np.abs(actions).max() <= 1.0
