@@ -191,6 +191,35 @@ def test_invalid_observation_term_is_refused(terms, message):
         make_env("lab/Own", guidance="kmp")
 
 
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"observe": returning((ObservationTerm("pose", center=[0.5] * 3),))},
+            "'pose' of lab/Own has 2 entries: center",
+        ),
+        ({"observe": returning(["pose"])}, r"observe returns terms, such as ObservationTerm\('pose'\), not 'pose'"),
+        ({"workcell": returning(3)}, "building lab/Own failed: .*AttributeError: 'int' object"),
+        ({"station": None}, "station of lab/Own is a class that register_station registers, not None"),
+        ({"reset": returning(np.zeros(2))}, r"reset of lab/Own returns a dict of values by name or None, not array"),
+        (
+            {"reset": lambda self, world, rng, given: 1 / 0},
+            r"reset of lab/Own failed: test_own_task.py, line .*ZeroDiv",
+        ),
+    ],
+)
+def test_error_in_a_method_of_a_task_is_one_sentence(attributes, message):
+    declare(**attributes)
+    with pytest.raises(InputError, match=message):
+        first_step()
+
+
+@pytest.mark.parametrize(("name", "method"), [("reset", lambda self, world: None), ("done", lambda: {})])
+def test_task_is_refused_when_a_method_lacks_parameters(name, method):
+    with pytest.raises(InputError, match=rf"{name} of Declared must have the parameters \(self"):
+        declare(**{name: method})
+
+
 def test_observation_is_centered_and_scaled_by_entry():
     declare(observe=returning((ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),)))
     env = make_env("lab/Own", guidance="kmp")
