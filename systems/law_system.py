@@ -1,7 +1,6 @@
 """Guidance by a law, which is evaluated once per control period."""
 
 import logging
-from numbers import Number
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,7 @@ def _flat(state: Any) -> np.ndarray:
     """Return the numbers of a law's state, an array or a named tuple of arrays, numbers and further named tuples."""
     if isinstance(state, tuple) and hasattr(state, "_fields"):
         return np.concatenate([np.zeros(0), *map(_flat, state)])
-    if not isinstance(state, np.ndarray | np.generic | Number):
+    if not isinstance(state, np.ndarray | np.generic | float | int):
         raise InputError(f"the state of a law is an array, or a named tuple of arrays and numbers, not {brief(state)}")
     return np.ravel(state).astype(float)
 

@@ -302,7 +302,8 @@ class Loop:
 
     def add_reward(self) -> RewardSystem:
         """Add the sum of the task's reward terms."""
-        task, user = self.task, f"reward {self.task.reward!r} of {self.task.name}"
+        task, is_named = self.task, "reward" in type(self.task).__annotations__
+        user = f"the reward {task.reward!r} of {task.name}" if is_named else f"the reward of {task.name}"
         functions = task.rewards()
         repeat = ConstantVectorSource([float(self.config.action_repeat)])
         if any("action_repeat" in signals_of(function, user) for function in functions.values()):

@@ -149,9 +149,9 @@ def returning(value):
     [
         ({"rewards": returning({"a": lambda pose: np.nan})}, "reward term 'a' of lab/Own is not finite, but nan"),
         ({"rewards": returning({"a": lambda pose: pose})}, "reward term 'a' of lab/Own must be one number, and it is"),
-        ({"rewards": returning({"a": lambda place: 0.0})}, "reward 'sparse' of lab/Own needs the signal 'place'"),
-        ({"rewards": returning({"a": 3.0})}, "reward 'sparse' of lab/Own is a function of signals, .*, not 3.0"),
-        ({"rewards": returning({"a": max})}, "reward 'sparse' of lab/Own "),
+        ({"rewards": returning({"a": lambda place: 0.0})}, "the reward of lab/Own needs the signal 'place'"),
+        ({"rewards": returning({"a": 3.0})}, "the reward of lab/Own is a function of signals, .*, not 3.0"),
+        ({"rewards": returning({"a": max})}, "the reward of lab/Own "),
         ({"rewards": returning(HUGE)}, "the sum of the reward terms of lab/Own is not finite, but inf"),
         ({"done": returning({"success": lambda place: False})}, "termination of lab/Own needs the signal 'place'"),
         ({"done": returning({"won": lambda pose: False})}, "an episode can't end as 'won', only as success"),
