@@ -1,14 +1,19 @@
 """Guidance by a law, which is evaluated once per control period."""
 
+import logging
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.laws.law import Law, check_command, check_law, safe_command
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class LawSystem(LeafSystem):
@@ -68,15 +73,22 @@ class LawSystem(LeafSystem):
         pose = declare.start_pose(self._pose_port.Eval(context))
         state = self._law.start(pose.copy())
         inputs = (port.Eval(context) for port in (self._action_port, self._pose_port, self._wrench_port))
-        check_command(self._law.command(state, *inputs), len(pose))
-        discrete_state.set_value(self._state, _flat(state))
+        if not is_finite(check_command(self._law.command(state, *inputs), len(pose)).pose):
+            _LOGGER.warning("%s commands no finite pose at its first step: it is held", type(self._law).__name__)
+        self._set_state(discrete_state, state)
         discrete_state.set_value(self._last, pose)
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         command = self._command.Eval(context)
         state = self._law.next(self._law_state(context), command, self._pose_port.Eval(context))
-        discrete_state.set_value(self._state, _flat(state))
+        self._set_state(discrete_state, state)
         discrete_state.set_value(self._last, command.pose)
+
+    def _set_state(self, discrete_state: DiscreteValues, state: Any) -> None:
+        numbers, size = _flat(state), discrete_state.value(self._state).size
+        if numbers.size != size:
+            raise InputError(f"the state of a law has the size of its first state, {size}, not {numbers.size}")
+        discrete_state.set_value(self._state, numbers)
 
     def _calc_command(self, context: Context, value: AbstractValue) -> None:
         last = declare.initialized(self, context, self._last)
@@ -88,17 +100,17 @@ class LawSystem(LeafSystem):
 
 
 def _flat(state: Any) -> np.ndarray:
-    """Return the numbers of a law's state."""
-    parts = state if isinstance(state, tuple) else (state,)
-    return np.concatenate([np.ravel(part).astype(float) for part in parts])
+    """Return the numbers of a law's state, an array or a named tuple of arrays, numbers and further named tuples."""
+    if isinstance(state, tuple) and hasattr(state, "_fields"):
+        return np.concatenate([np.zeros(0), *map(_flat, state)])
+    if not isinstance(state, np.ndarray | np.generic | float | int):
+        raise InputError(f"the state of a law is an array, or a named tuple of arrays and numbers, not {brief(state)}")
+    return np.ravel(state).astype(float)
 
 
 def _like(example: Any, numbers: np.ndarray) -> Any:
     """Return the state of the type and the shapes of `example` with the given numbers."""
-    if not isinstance(example, tuple):
-        return numbers.reshape(np.shape(example))
-    sizes = [np.size(part) for part in example]
-    parts = zip(example, np.split(numbers, np.cumsum(sizes)[:-1]), strict=True)
-    return type(example)(
-        *(part.reshape(e.shape) if isinstance(e, np.ndarray) else type(e)(part[0]) for e, part in parts)
-    )
+    if isinstance(example, tuple):
+        sizes = [_flat(part).size for part in example]
+        return type(example)(*map(_like, example, np.split(numbers, np.cumsum(sizes)[:-1])))
+    return numbers.reshape(example.shape) if isinstance(example, np.ndarray) else type(example)(numbers[0])

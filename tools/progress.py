@@ -111,13 +111,12 @@ class EpisodeProgress:
 
         At least one `update` must precede the call. The success rate is left out if the environment reports no success.
         """
-        from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # imports pandas, which takes a second
+        from guiderail.tools.evaluation.metrics import violation_text  # imports pandas, which takes a second
 
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
-        violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} {VIOLATION}"
         prefix = "" if self._window is None else f"last {len(self._recent)}: "
         prefix += f"success {success:.0%}  " if self._reports_success else ""
-        return f"{prefix}return {returns:.1f}  largest violation {violation}"
+        return f"{prefix}return {returns:.1f}  largest violation {violation_text(self._max_violation)}"
 
     def _remaining(self, now: float) -> str:
         if self._done == self._episodes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,8 +33,8 @@ from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limi
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Condition, Threshold, World, signals_of
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.errors import InputError, brief, naming_failures
+from guiderail.models.common.registry import did_you_mean, is_sibling_module
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
@@ -301,7 +302,8 @@ class Loop:
 
     def add_reward(self) -> RewardSystem:
         """Add the sum of the task's reward terms."""
-        task, user = self.task, f"reward {self.task.reward!r} of {self.task.name}"
+        task, is_named = self.task, "reward" in type(self.task).__annotations__
+        user = f"the reward {task.reward!r} of {task.name}" if is_named else f"the reward of {task.name}"
         functions = task.rewards()
         repeat = ConstantVectorSource([float(self.config.action_repeat)])
         if any("action_repeat" in signals_of(function, user) for function in functions.values()):
@@ -513,10 +515,15 @@ def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagr
     """
     task = config.declared
     run: dict[str, Any] = {}
+    is_packaged = is_sibling_module(type(task).__module__)
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         given = validate_options(task.Reset, options, f"a reset of {task.name}")
-        sampled = task.reset(World(station, guidance, diagram, context, run), rng, given) or {}
+        with nullcontext() if is_packaged else naming_failures(f"reset of {task.name}", RuntimeError, SystemExit):
+            sampled = task.reset(World(station, guidance, diagram, context, run), rng, given)
+        sampled = {} if sampled is None else sampled
+        if not isinstance(sampled, Mapping):
+            raise InputError(f"reset of {task.name} returns a dict of values by name or None, not {brief(sampled)}")
         if reserved := [name for name in sampled if name in INFO_KEYS]:
             raise InputError(
                 f"reset of {task.name} returns a value named {reserved[0]!r}, which is reserved: give it another name"

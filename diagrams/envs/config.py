@@ -168,7 +168,7 @@ def stations_of(task: type[Task]) -> list[str]:
 
 def station_kind_of(task: type[Task]) -> StationKind:
     """Return the registered kind of a task's default station."""
-    return kind_of(task.station, task.name)
+    return kind_of(getattr(task, "station", None), task.name)
 
 
 def prior_of(task: type[Task]) -> Prior:

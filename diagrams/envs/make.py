@@ -7,6 +7,7 @@ import inspect
 import multiprocessing
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial, update_wrapper
 from pathlib import Path
@@ -37,7 +38,7 @@ from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
 from guiderail.diagrams.tasks.registry import content_digest
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.common.registry import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
@@ -266,10 +267,12 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
 def _build(
     config: EnvConfig, render_mode: str | None, before_build: Callable[[DiagramBuilder], object] | None
 ) -> BuiltDiagram:
-    station = make_station(config)
-    guidance = make_guidance(config, station)
-    diagram = build_task_diagram(config, station, guidance, render_mode=render_mode, before_build=before_build)
-    return BuiltDiagram(diagram, station, guidance)
+    builders = type(config.declared), config.guidance_kind.build, config.station_kind.build
+    with nullcontext() if all(map(_is_packaged, builders)) else naming_failures(f"building {config.task}", ImportError):
+        station = make_station(config)
+        guidance = make_guidance(config, station)
+        diagram = build_task_diagram(config, station, guidance, render_mode=render_mode, before_build=before_build)
+        return BuiltDiagram(diagram, station, guidance)
 
 
 def _key(config: EnvConfig, render_mode: str | None) -> Hashable:

@@ -62,7 +62,11 @@ class Observed:
     @classmethod
     def of(cls, declared: Sequence[ObservationTerm] | Observed) -> Observed:
         """Return what `Task.observe` declares, which may be a list of terms."""
-        return declared if isinstance(declared, Observed) else cls(declared)
+        observed = declared if isinstance(declared, Observed) else cls(declared)
+        for term in (*observed.terms, *observed.privileged):
+            if not isinstance(term, ObservationTerm):
+                raise InputError(f"observe returns terms, such as ObservationTerm('pose'), not {brief(term)}")
+        return observed
 
 
 class ImageAndStateSpace(gymnasium.spaces.Box):
@@ -182,7 +186,13 @@ def _add_clock(
 def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
-    center, scale = (np.broadcast_to(values, len(selection)).astype(float) for values in (term.center, term.scale))
+    try:
+        center, scale = (np.broadcast_to(values, len(selection)).astype(float) for values in (term.center, term.scale))
+    except ValueError:
+        raise InputError(
+            f"the observed signal {term.signal!r}{of_task} has {len(selection)} entries: center and scale are one "
+            "number or as many numbers"
+        ) from None
     with np.errstate(all="ignore"):
         is_usable = np.isfinite(1.0 / scale).all() and np.isfinite([center, scale, center / scale]).all()
     if not is_usable:

@@ -156,11 +156,12 @@ def scene_of(station: Any) -> OutputPort:
     """Return the query port of a station's scene.
 
     Raises:
-        InputError: If the station has no scene, because it is a real robot.
+        InputError: If the station exports no scene, such as a real robot.
     """
     if not station.HasOutputPort("query"):
         raise InputError(
-            "this station has no scene to render: choose a simulated one, or another observation and no render_mode"
+            "this station has no port `query` for pictures: let its `finish` export it, or choose another station, or "
+            "another observation and no render_mode"
         )
     return station.GetOutputPort("query")
 

@@ -83,7 +83,10 @@ def register_guidance(name: str, **declared: Any) -> Callable[[Builder], Builder
             it if another kind of guidance has this name.
     """
     GUIDANCE.check_name(name)
-    for requirement in chain(*declared.get("needs", ())):
+    needs = declared.get("needs", ())
+    if not isinstance(needs, tuple) or not all(isinstance(each, tuple) for each in needs):
+        raise InputError(f'needs of {name!r} is a tuple of tuples, as in (("demonstrations",),), not {brief(needs)}')
+    for requirement in chain(*needs):
         if requirement not in REQUIREMENTS:
             raise InputError(f"guidance {name!r} needs {brief(requirement)}: {did_you_mean(requirement, REQUIREMENTS)}")
 
@@ -122,9 +125,9 @@ def check_guidance(name: str, provided: Collection[str], task: str = "this task"
     kind = GUIDANCE.get(name)
     if missing := missing_requirements(kind.needs, provided):
         needed = " and ".join(REQUIREMENTS.get(requirement, requirement) for requirement in missing)
-        raise InputError(
-            f"guidance '{name}' needs {needed}, which {task} doesn't have: use {', '.join(possible_guidance(provided))}"
-        )
+        possible = possible_guidance(provided)
+        remedy = f"use {', '.join(possible)}" if possible else "return a Prior with it from prior()"
+        raise InputError(f"guidance '{name}' needs {needed}, which {task} doesn't have: {remedy}")
     return kind
 
 

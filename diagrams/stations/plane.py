@@ -9,11 +9,12 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
+from pydrake.systems.primitives import Adder, Gain, MatrixGain, Multiplexer, Saturation
 
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     Station,
+    add_contact_force,
     add_plant,
     check_pose,
     command_timeout,
@@ -26,7 +27,6 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.systems.command_checks import CommandWatchdog
-from guiderail.systems.wrench_signals import MeanForce
 
 OBSTACLE_Z = -0.035  # height of the visual obstacles [m]; the robot passes above them
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
@@ -134,21 +134,14 @@ class PlaneStation(Station):
         negative = add_system(builder, "negative_force", Gain(-1.0, 2), applied).get_output_port()
         excess = add_system(builder, "excess_force", Adder(2, 2), force, negative)
 
-        contact_force = self.plant.get_generalized_contact_forces_output_port(self._robot)
-        force_sum = LinearSystem(identity, identity, identity, 0 * identity, config.plant_period)
-        add_system(builder, "force_sum", force_sum, contact_force)
-        mean_force = MeanForce(2, config.substeps, config.control_period)
-        add_system(builder, "mean_force", mean_force, force_sum=force_sum.get_output_port())
-
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
             watchdog.get_command_time_input_port(),
             pose=pose,
-            wrench=mean_force.get_force_output_port(),
-            contact_force=mean_force.get_magnitude_output_port(),
             saturation=excess.get_output_port(),
             command_timed_out=watchdog.get_command_timed_out_output_port(),
+            **add_contact_force(builder, self.plant, self._robot, config.control_period),
         )
         export_scene_ports(builder, self.plant, self.scene_graph)
         builder.BuildInto(self)

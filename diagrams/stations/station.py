@@ -47,16 +47,18 @@ from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, PassThrough
+from pydrake.systems.primitives import ConstantVectorSource, LinearSystem, MatrixGain, PassThrough
 
 from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.wrench import FORCE_SHARES, POSE_ORDER, WrenchBound
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
+from guiderail.systems.wrench_signals import MeanForce
 
 if TYPE_CHECKING:
     from guiderail.diagrams.stations.workcell import Workcell
@@ -330,10 +332,25 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared | config), builder)
 
 
+def add_contact_force(
+    builder: DiagramBuilder, plant: MultibodyPlant, robot: ModelInstanceIndex, control_period: float
+) -> dict[str, OutputPort]:
+    """Add the mean contact force of a control step on each joint; return `wrench` and `contact_force` by name."""
+    n, step = plant.num_velocities(robot), plant.time_step()
+    total = LinearSystem(np.eye(n), np.eye(n), np.eye(n), np.zeros((n, n)), step)
+    add_system(builder, "force_sum", total, plant.get_generalized_contact_forces_output_port(robot))
+    mean = MeanForce(n, round(control_period / step), control_period)
+    add_system(builder, "mean_force", mean, force_sum=total.get_output_port())
+    return {"wrench": mean.get_force_output_port(), "contact_force": mean.get_magnitude_output_port()}
+
+
 class JointStation(Station):
     """Station of a robot whose pose is the positions of its joints, which follow a command by their own PD gains.
 
-    A subclass adds the robot.
+    A subclass adds the robot. `wrench` (O,) is the force [N] or torque [Nm] of contacts on each joint, averaged over
+    the control step, and `contact_force` its norm. For other outputs, override `finish(builder, desired_pose, **ports)`
+    and pass them to that of the base class by name; `wrench` and `contact_force` must not have direct feedthrough from
+    `desired_pose`.
 
     Args:
         workcell: Workcell of the task, which `add_robot` gets.
@@ -350,17 +367,26 @@ class JointStation(Station):
         builder = DiagramBuilder()
         self.plant, self.scene_graph = plant, _ = add_plant(builder, self.plant_step)
         robot = self.add_robot(plant, workcell)
+        if not isinstance(robot, ModelInstanceIndex):
+            raise InputError(f"add_robot of {type(self).__name__} must return the robot's model, not {brief(robot)}")
         plant.Finalize()
         n = plant.num_positions(robot)
+        actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices(robot))
+        if sum(actuator.has_controller() for actuator in actuators) != n:
+            raise InputError(
+                f"each joint of {type(self).__name__} needs an actuator with PD gains: set_controller_gains(...)"
+            )
         desired = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * n, n)))  # at rest
         builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(robot))
         positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
         builder.Connect(plant.get_state_output_port(robot), positions.get_input_port())
-        self.finish(builder, desired.get_input_port(), pose=positions.get_output_port())
+        export_scene_ports(builder, plant, self.scene_graph)
+        forces = add_contact_force(builder, plant, robot, self.control_period)
+        self.finish(builder, desired.get_input_port(), pose=positions.get_output_port(), **forces)
 
     def add_robot(self, plant: MultibodyPlant, workcell: Any) -> ModelInstanceIndex:
         """Add joints with PD gains, and what surrounds them, to the plant; return the model of the joints."""
-        raise NotImplementedError
+        raise InputError(f"{type(self).__name__} needs a method add_robot(plant, workcell)")
 
 
 def plant_period(workcell: Workcell, longest: float = PLANT_PERIOD) -> float:

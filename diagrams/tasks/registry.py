@@ -6,13 +6,15 @@ This module is imported by `import guiderail`, so it imports neither Drake nor p
 from __future__ import annotations
 
 from collections.abc import Callable
+from difflib import get_close_matches
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, TypeVar
 
 import gymnasium
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry, check_class, did_you_mean, load_plugin
+from guiderail.models.common.registry import Registry, check_class, check_methods, did_you_mean, load_plugin
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
@@ -69,10 +71,23 @@ def check_task_name(name: object) -> None:
 
 
 def _check(name: str, task: type[Task]) -> None:
-    """Raise an `InputError` if an object is no task class, or the class lacks a method."""
+    """Raise an `InputError` if an object is no task class, or the class lacks or misspells a method."""
     from guiderail.diagrams.tasks.task import Task
 
     check_class(name, task, Task)
+    check_methods(task, Task)
+    bases = [base for base in task.__mro__[1:] if issubclass(base, Task)]
+    known = {each for base in bases for each in (*vars(base), *base.__annotations__)}
+    # A method in place of an option becomes its default value.
+    for own in (name for name, option in task.model_fields.items() if isinstance(option.default, FunctionType)):
+        raise InputError(f"{own!r} is an option of {task.__name__}, not a method: {did_you_mean(own, known)}")
+    for own in [each for each in vars(task) if not each.startswith("_") and each not in known]:
+        # The environment would ignore the method in silence. Other public methods are helpers of the task.
+        if own == "motion_constraints":
+            raise InputError("motion constraints are part of the prior: return Prior(reference, linear, motion=...)")
+        is_method = isinstance(vars(task)[own], FunctionType | property)
+        if get_close_matches(own, known, 1, 0.6 if is_method else 0.8):
+            raise InputError(f"Task has no method {own!r}: {did_you_mean(own, known)} Begin a helper's name with '_'")
 
 
 def is_task_folder(name: str | Path) -> bool:

@@ -42,12 +42,12 @@ def brief(value: Any) -> str:
 
 
 @contextmanager
-def naming_failures(action: str, *unchanged: type[Exception]) -> Iterator[None]:
+def naming_failures(action: str, *unchanged: type[BaseException]) -> Iterator[None]:
     """Convert an error in a user's code to an `InputError` that names the action, the file, the line and the error.
 
     An `InputError` and errors of the types `unchanged` are raised unchanged.
     """
-    reraised: tuple[type[Exception], ...] = (InputError, *unchanged)
+    reraised: tuple[type[BaseException], ...] = (InputError, *unchanged)
     try:
         yield
     except reraised:

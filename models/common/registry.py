@@ -17,8 +17,9 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
+from inspect import getattr_static, signature
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, Generic, TypeVar, overload
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
@@ -335,6 +336,22 @@ def check_class(name: str, value: object, kind: type) -> None:
     missing = sorted(getattr(value, "__abstractmethods__", ()))
     if missing:
         raise InputError(f"the class {value.__name__} lacks {', '.join(missing)}: see `{kind.__name__}`")
+
+
+def check_methods(kind: type, base: type) -> None:
+    """Raise an InputError if a class redefines a public method of `base` so that callers of `base` cannot call it."""
+    for name, expected in vars(base).items():
+        own = getattr_static(kind, name)
+        if name.startswith("_") or not (isinstance(expected, FunctionType) and isinstance(own, FunctionType)):
+            continue
+        parameters = signature(expected).parameters
+        try:
+            signature(own).bind(*parameters)
+        except TypeError:
+            raise InputError(
+                f"{name} of {kind.__name__} must have the parameters ({', '.join(parameters)}), not "
+                f"({', '.join(signature(own).parameters)})"
+            ) from None
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import check_methods
 
 
 class Command(NamedTuple):
@@ -27,8 +27,8 @@ class Law:
         command_k = command(state_k, action_k, pose_k, wrench_k),    state_{k+1} = next(state_k, command_k, pose_{k+1})
 
     A subclass implements `command`. By default, the state is the last command, at first the measured pose. With `start`
-    and `next`, the state is any array, or a named tuple of arrays and numbers, of constant size. The methods must not
-    keep values elsewhere, because a reset restores only the state.
+    and `next`, the state is any array, or a named tuple of arrays, numbers and such tuples, of constant size. The
+    methods must not keep values elsewhere, because a reset restores only the state.
 
     Args:
         num_outputs: Size O of the pose and of the command, at least 1.
@@ -80,16 +80,9 @@ def check_law(law: object) -> None:
     """Raise an InputError unless an object is a `Law` whose `command` takes state, action, pose and wrench."""
     if not isinstance(law, Law) or not hasattr(law, "num_outputs"):
         raise InputError(f"guidance needs a Law, whose constructor calls that of Law, not {brief(law)}")
-    for method, arguments in (("start", 1), ("command", 4), ("next", 3)):
-        parameters = signature(getattr(law, method))
-        try:
-            parameters.bind(*range(arguments))
-        except TypeError:
-            expected = ", ".join(signature(getattr(Law, method)).parameters)
-            raise InputError(
-                f"{method} of {type(law).__name__} must have the parameters ({expected}), not (self, "
-                f"{', '.join(parameters.parameters)})"
-            ) from None
+    check_methods(type(law), Law)
+    if type(law).command is Law.command:
+        raise InputError(f"{type(law).__name__} needs a method command(self, state, action, pose, wrench)")
 
 
 def check_command(returned: Any, num_outputs: int) -> Command:

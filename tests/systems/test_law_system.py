@@ -139,6 +139,54 @@ def test_law_is_refused_when_a_method_lacks_parameters(name, method):
         LawSystem(law, 1, PERIOD)
 
 
+def test_law_without_command_is_refused():
+    with pytest.raises(InputError, match="Law needs a method command"):
+        LawSystem(Law(2), 1, PERIOD)
+
+
+@pytest.mark.parametrize("state", [(np.zeros(2), 1), {"pose": np.zeros(2)}, [0.0, 0.0], None])
+def test_law_is_refused_when_its_state_is_no_array_or_named_tuple(state):
+    law = type("Wrong", (Integrator,), {"start": lambda self, pose: state})(2)
+    with pytest.raises(InputError, match="the state of a law is an array, or a named tuple of arrays and numbers, not"):
+        LawSystem(law, 1, PERIOD)
+
+
+def test_state_of_another_size_than_the_first_is_refused():
+    law = type("Wrong", (Integrator,), {"next": lambda self, last, command, pose: np.zeros(3)})(2)
+    simulator, _, _ = simulate(law, action=(0.5, 0.0))
+    with pytest.raises(InputError, match="the state of a law has the size of its first state, 2, not 3"):
+        simulator.AdvanceTo(1.5 * PERIOD)
+
+
+def test_state_may_contain_the_state_of_another_law():
+    class Outer(NamedTuple):
+        inner: Memory
+        number: int
+
+    class Nested(Filter):
+        def start(self, pose):
+            return Outer(super().start(pose), 0)
+
+        def command(self, state, action, pose, wrench):
+            return super().command(state.inner, action, pose, wrench)
+
+        def next(self, state, command, pose):
+            assert isinstance(state.inner.count, int)
+            return Outer(super().next(state.inner, command, pose), state.number + 1)
+
+    commands = []
+    for law in (Filter(2), Nested(2)):
+        simulator, _, read = simulate(law, action=(0.5, 0.25))
+        simulator.AdvanceTo(3.5 * PERIOD)
+        commands.append(read("desired_pose"))
+    assert commands[0] == commands[1]
+
+
+def test_warning_names_a_law_that_commands_nan_at_its_first_step(caplog):
+    simulate(lambda action, pose, wrench: [np.nan, 0.0])
+    assert "FunctionLaw commands no finite pose at its first step" in caplog.text
+
+
 def test_measured_pose_at_initialization_must_be_finite():
     with pytest.raises(InputError, match="measured pose must be finite"):
         simulate(lambda action, pose, wrench: pose, pose=(1.0, np.nan))

@@ -85,6 +85,22 @@ def test_task_that_lacks_methods_is_refused_with_their_names():
         declare(of=Task, station=PlaneStation)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("reward_terms", lambda self: {}, "Task has no method 'reward_terms': did you mean rewards?"),
+        ("reward", lambda self: {}, "'reward' is an option of Declared, not a method: did you mean rewards?"),
+        ("colision", property(lambda self: None), "did you mean collision?"),
+        ("clipp", 2.0, "did you mean clip?"),
+        ("motion_constraints", lambda self: None, r"return Prior\(reference, linear, motion=\.\.\.\)"),
+    ],
+)
+def test_misspelled_method_of_a_task_is_refused(name, value, message):
+    with pytest.raises(InputError, match=message):
+        declare(**{name: value})
+    declare(**{"_" + name: value, "goal": value, "station": lambda workcell: None})
+
+
 def test_default_guidance_has_an_effect():
     declare()
     assert possible_guidance(prior_of(TASKS.get("lab/Own")).provides)[0] == "base_policy"
@@ -133,9 +149,9 @@ def returning(value):
     [
         ({"rewards": returning({"a": lambda pose: np.nan})}, "reward term 'a' of lab/Own is not finite, but nan"),
         ({"rewards": returning({"a": lambda pose: pose})}, "reward term 'a' of lab/Own must be one number, and it is"),
-        ({"rewards": returning({"a": lambda place: 0.0})}, "reward 'sparse' of lab/Own needs the signal 'place'"),
-        ({"rewards": returning({"a": 3.0})}, "reward 'sparse' of lab/Own is a function of signals, .*, not 3.0"),
-        ({"rewards": returning({"a": max})}, "reward 'sparse' of lab/Own "),
+        ({"rewards": returning({"a": lambda place: 0.0})}, "the reward of lab/Own needs the signal 'place'"),
+        ({"rewards": returning({"a": 3.0})}, "the reward of lab/Own is a function of signals, .*, not 3.0"),
+        ({"rewards": returning({"a": max})}, "the reward of lab/Own "),
         ({"rewards": returning(HUGE)}, "the sum of the reward terms of lab/Own is not finite, but inf"),
         ({"done": returning({"success": lambda place: False})}, "termination of lab/Own needs the signal 'place'"),
         ({"done": returning({"won": lambda pose: False})}, "an episode can't end as 'won', only as success"),
@@ -173,6 +189,35 @@ def test_invalid_observation_term_is_refused(terms, message):
     declare(observe=returning(terms))
     with pytest.raises(InputError, match=message):
         make_env("lab/Own", guidance="kmp")
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"observe": returning((ObservationTerm("pose", center=[0.5] * 3),))},
+            "'pose' of lab/Own has 2 entries: center",
+        ),
+        ({"observe": returning(["pose"])}, r"observe returns terms, such as ObservationTerm\('pose'\), not 'pose'"),
+        ({"workcell": returning(3)}, "building lab/Own failed: .*AttributeError: 'int' object"),
+        ({"station": None}, "station of lab/Own is a class that register_station registers, not None"),
+        ({"reset": returning(np.zeros(2))}, r"reset of lab/Own returns a dict of values by name or None, not array"),
+        (
+            {"reset": lambda self, world, rng, given: 1 / 0},
+            r"reset of lab/Own failed: test_own_task.py, line .*ZeroDiv",
+        ),
+    ],
+)
+def test_error_in_a_method_of_a_task_is_one_sentence(attributes, message):
+    declare(**attributes)
+    with pytest.raises(InputError, match=message):
+        first_step()
+
+
+@pytest.mark.parametrize(("name", "method"), [("reset", lambda self, world: None), ("done", lambda: {})])
+def test_task_is_refused_when_a_method_lacks_parameters(name, method):
+    with pytest.raises(InputError, match=rf"{name} of Declared must have the parameters \(self"):
+        declare(**{name: method})
 
 
 def test_observation_is_centered_and_scaled_by_entry():

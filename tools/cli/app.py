@@ -6,7 +6,6 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
 from itertools import pairwise
@@ -57,13 +56,16 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
     if as_json:
         typer.echo(to_json(result))
         return
-    from guiderail.tools.evaluation.metrics import STATISTICS, SYMBOLS, VIOLATION
+    from guiderail.tools.evaluation.metrics import STATISTICS, SYMBOLS, VIOLATION, violation_text
     from guiderail.tools.tables import cell
+
+    def text_of(key: str, value: Any) -> str:
+        is_violation = units.get(key) == VIOLATION and isinstance(value, float)
+        return violation_text(value, cell(value)) if is_violation else cell(value)
 
     columns = [*result.get("baselines", ())]
     labels = {key: key if " " in key else key.replace("_", space) for key in result}
     units = {key: STATISTICS[key].unit for key in {*result} & {*STATISTICS}}
-    is_none = partial(_is_none, {key for key, unit in units.items() if unit == VIOLATION})
     labels |= {key: f"{labels[key]} [{unit}]" for key, unit in units.items() if unit in SYMBOLS}
     width = max(len(label) for label in labels.values())
     if columns:
@@ -76,15 +78,8 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
         ):
             continue
         values = [value, *(result[f"{name}_{key}"] for name in columns if f"{name}_{key}" in result)]
-        cells = ["none" if is_none(key, entry) else cell(entry) for entry in values]
+        cells = [text_of(key, entry) for entry in values]
         typer.echo("  ".join([f"{labels[key]:<{width}}", *(f"{text:<{COLUMN}}" for text in cells)]).rstrip())
-
-
-def _is_none(violations: set[str], key: str, value: Any) -> bool:
-    """Return True if a value is a constraint violation that is none, up to rounding of the primitive's solver."""
-    from guiderail.tools.evaluation.metrics import TOLERANCE
-
-    return key in violations and isinstance(value, float) and value <= TOLERANCE
 
 
 # Commands import their tools when they are called, because PyTorch and Drake take seconds to import.

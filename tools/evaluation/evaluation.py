@@ -21,7 +21,7 @@ import scipy  # `scipy.stats` is imported on first use
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import task_content
-from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, reports_success
+from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, UNCONSTRAINED, reports_success
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, installed_versions
 from guiderail.tools.tables import read_table, table_text
@@ -167,7 +167,9 @@ class Evaluation(Mapping[str, Any]):
             text += f" (one-sided p = {p:.2g})"
         violation = self.statistics.get("max_commanded_violation")
         if violation is not None:
-            if violation <= TOLERANCE:
+            if violation <= UNCONSTRAINED:
+                text += "; the commands were not checked, because there is no constraint"
+            elif violation <= TOLERANCE:
                 text += "; every command satisfied the constraints"
             elif violation > TOLERANCE:
                 text += f"; the largest constraint violation of a command was {violation:.2g} m or rad"

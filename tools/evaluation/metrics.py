@@ -48,8 +48,16 @@ def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
 
 
 STEPS, VIOLATION = "control steps", "m or rad"
+UNCONSTRAINED = -1e30  # violation without any constraint, as `ConstraintViolation.UNCONSTRAINED`
 ENDINGS = "success, collision, spill, blocked, violation, terminated, time_limit or simulation_failure"
 COLLISION = "contact force, or the task's own collision signal, above its limit"
+
+
+def violation_text(violation: float, text: str = f"{{:.1e}} {VIOLATION}") -> str:
+    """Return the largest violation of episodes for a reader; `text` formats one above the solver's rounding."""
+    if violation <= UNCONSTRAINED:
+        return "unconstrained"
+    return "none" if violation <= TOLERANCE else text.format(violation)
 
 
 class Column(NamedTuple):
@@ -61,7 +69,11 @@ class Column(NamedTuple):
 
 
 VIOLATIONS = tuple(
-    Column(f"max_{which}_violation", VIOLATION, f"largest constraint violation of any {which} pose; negative is slack")
+    Column(
+        f"max_{which}_violation",
+        VIOLATION,
+        f"largest constraint violation of any {which} pose; negative: slack; −1e30: unconstrained",
+    )
     for which in ("commanded", "measured")
 )
 COLUMNS = (

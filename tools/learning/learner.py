@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass, is_pydantic_dataclass
 
 from guiderail.diagrams.envs.options import Integer
 from guiderail.models.common.errors import InputError, brief, require_extra
-from guiderail.models.common.registry import Registry, did_you_mean
+from guiderail.models.common.registry import Registry, check_class, check_methods, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Callback, has_image
 
@@ -123,7 +123,7 @@ class Learner(Callback, ABC):
 
     @abstractmethod
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the learned policy.
+        """Return the learned policy; also called once before the first episode of a learner of another package.
 
         Args:
             description: Description of the policy: the observation's shape and the limits of an action. A learner may
@@ -145,6 +145,8 @@ class Learner(Callback, ABC):
         """
         if self.stored is None:
             raise InputError(f"{type(self).__name__} names nothing in stored, and has no state() and restore()")
+        if missing := [name for name in self.stored if not hasattr(self, name)]:
+            raise InputError(f"{type(self).__name__} has no attribute {missing[0]!r}, which it names in stored")
         own = {name: getattr(self, name) for name in self.stored}
         arrays = {name: value for name, value in own.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in own.items() if name not in arrays}
@@ -175,6 +177,10 @@ def _check_learner(name: str, learner: Any) -> None:
     """Raise an InputError if a learner's name cannot name a file, or the learner has no class of settings."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise InputError(f"the name of a learner has letters, digits, '_', '-' and '.', unlike {brief(name)}")
+    if isinstance(learner, type) and issubclass(learner, Learner):
+        check_class(name, learner, Learner)
+        for base in (Learner, Callback):
+            check_methods(learner, base)
     config = getattr(learner, "Config", None)
     if not (isinstance(config, type) and issubclass(config, LearnerConfig) and is_pydantic_dataclass(config)):
         raise InputError(f"Config of {name} must be a pydantic dataclass based on LearnerConfig, not {brief(config)}")

@@ -268,8 +268,12 @@ class OffPolicyLearner(Learner):
         return not self.is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
-        """Return a sampled action (A,) for an observation (n,); a subclass with a deterministic policy adds noise."""
-        return self.model.predict(observation, deterministic=False)[0]
+        """Return a sampled action (A,) for an observation (n,): with noise if the policy is deterministic."""
+        action, space = self.model.predict(observation, deterministic=False)[0], self.model.action_space
+        if not isinstance(self.model, TD3):  # or DDPG, which Stable-Baselines3 derives from TD3
+            return action
+        deviation = TD3_NOISE * (space.high - space.low) / 2
+        return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
 
     def _temporally_extended(self) -> np.ndarray | None:
         """Return a uniformly sampled action that is repeated for several transitions; None if no repetition is active.
@@ -464,12 +468,6 @@ class Td3Learner(OffPolicyLearner):
     """Learner of twin delayed DDPG (TD3; Fujimoto, van Hoof and Meger, 2018), which explores with Gaussian noise."""
 
     algorithm = TD3
-
-    def explore(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action plus noise, clipped to the action space."""
-        action, space = super().explore(observation), self.model.action_space
-        deviation = TD3_NOISE * (space.high - space.low) / 2
-        return np.clip(self.random.normal(action, deviation), space.low, space.high).astype(space.dtype)
 
 
 @register_learner("crossq")

@@ -128,6 +128,10 @@ def run_training(
             if config.learner.num_envs:
                 raise InputError("callbacks need the episodes in this process: leave num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
+        if not resume and not LEARNERS.is_packaged(config.learner.algorithm):
+            first = TrainingLoop(folder, learner, episodes)
+            first.learner_state()  # an error in one of these methods must not cost the run
+            first.learner_policy()
         stack.enter_context(folder.locked())
         if config.learner.num_envs:
             episodes = ActorEpisodes(episodes, learner)
@@ -279,10 +283,8 @@ class TrainingLoop:
 
     def write_checkpoint(self) -> None:
         """Write the checkpoint: the run's identity, the episodes' rows, and the states of learner and environment."""
-        started, name = time.perf_counter(), f"{type(self._learner).__name__}.state"
-        with _naming_failures(self._episodes.config, name):
-            state = self._learner.state()
-        arrays, values = _checked_state(name, state)
+        started = time.perf_counter()
+        arrays, values = self.learner_state()
         own_arrays, own_values = self._episodes.state()
         stored = {
             "run": self._episodes.config.identity,
@@ -294,6 +296,13 @@ class TrainingLoop:
         arrays = {**arrays, **{f"episodes/{key}": array for key, array in own_arrays.items()}}
         save_checkpoint(self._folder.checkpoint, arrays, stored)
         self._last_saving_time += time.perf_counter() - started
+
+    def learner_state(self) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
+        """Return the learner's arrays and values; raise an `InputError` if `Learner.state` fails or returns others."""
+        name = f"{type(self._learner).__name__}.state"
+        with _naming_failures(self._episodes.config, name):
+            state = self._learner.state()
+        return _checked_state(name, state)
 
     def restore(self) -> None:
         """Restore rows, learner and episodes from the checkpoint; without checkpoint and table, there are no rows."""
@@ -332,8 +341,8 @@ class TrainingLoop:
         if len(written) < len(rows):  # the run was killed between writing the two files
             folder.write_episodes(rows)
 
-    def save_policy(self) -> None:
-        """Write the learned policy; raise an `InputError` if `Learner.policy` fails or returns no `Policy`."""
+    def learner_policy(self) -> Policy:
+        """Return the learned policy; raise an `InputError` if `Learner.policy` fails or returns no `Policy`."""
         config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
         try:
             with _naming_failures(config, name, ValueError):
@@ -344,7 +353,11 @@ class TrainingLoop:
             raise InputError(f"{name} failed: {error}") from error
         if not isinstance(policy, Policy):
             raise InputError(f"{name} must return a Policy, not {brief(policy)}")
-        policy.save(self._folder.path, write=write_atomically)
+        return policy
+
+    def save_policy(self) -> None:
+        """Write the learned policy."""
+        self.learner_policy().save(self._folder.path, write=write_atomically)
 
 
 def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -> AbstractContextManager[None]:

@@ -34,7 +34,7 @@ from guiderail.systems.command_checks import ConstraintViolation
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn, Transition
-from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
+from guiderail.tools.evaluation.metrics import VIOLATION, violation_text
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_page, write_atomically
@@ -304,7 +304,7 @@ def find_report(html: Path, run: Path | None) -> str | None:
 def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
     """Format a row's return and largest constraint violations; `scale` is the number of units per m or rad."""
     violations = (
-        f"{name} {'none' if row[key] <= TOLERANCE else f'{scale * row[key]:.2g} {unit}'}"
+        f"{name} {violation_text(row[key], f'{scale * row[key]:.2g} {unit}')}"
         for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))
     )
     return f"return {row['return']:.1f}; largest constraint violation: {', '.join(violations)}"

@@ -7,7 +7,7 @@ from pydrake.systems.primitives import PassThrough
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, check_guidance, register_guidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws import Law
 
@@ -69,6 +69,16 @@ def test_guidance_without_a_port_is_refused_by_its_name(monkeypatch):
 def test_unknown_need_is_refused():
     with pytest.raises(InputError, match="guidance 'wrong' needs 'demonstration': did you mean demonstrations"):
         register_guidance("wrong", needs=(("demonstration",),))
+    for needs in (("demonstrations",), "demonstrations"):
+        with pytest.raises(
+            InputError, match=r"needs of 'wrong' is a tuple of tuples, as in \(\(\"demonstrations\",\),\)"
+        ):
+            register_guidance("wrong", needs=needs)
+
+
+def test_guidance_without_an_alternative_names_the_prior():
+    with pytest.raises(InputError, match=r"which lab/Post doesn't have: return a Prior with it from prior\(\)$"):
+        check_guidance("skgrl", (), "lab/Post")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluate import _save_demonstrations, evaluate, evaluate_policy
-from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute
+from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, statistics
+from guiderail.tools.evaluation.metrics import UNCONSTRAINED
 from guiderail.tools.evaluation.subject import evaluation_scope, outcome, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import Run
@@ -231,6 +232,12 @@ def test_evaluation_has_a_table_and_a_sentence(bead_run):
     assert result.sentence.endswith("; every command satisfied the constraints.")
     assert result.sentence in str(result)
     assert result.sentence in result._repr_html_()
+
+
+def test_sentence_says_that_commands_were_not_checked_without_constraints():
+    rows = {"policy": pd.DataFrame({"success": [1], "max_commanded_violation": [UNCONSTRAINED]})}
+    result = Evaluation(statistics(rows["policy"]), rows)
+    assert "the commands were not checked, because there is no constraint" in result.sentence
 
 
 def test_table_omits_collisions_that_are_not_counted():

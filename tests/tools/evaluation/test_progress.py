@@ -3,6 +3,8 @@ import math
 
 from rich.console import Console
 
+from guiderail.systems.command_checks import ConstraintViolation
+from guiderail.tools.evaluation.metrics import UNCONSTRAINED
 from guiderail.tools.progress import EpisodeProgress
 
 
@@ -57,6 +59,13 @@ def test_status_omits_success_when_none_is_reported():
     progress = EpisodeProgress(2)
     row = {"episode": 0, "success": 0, "return": 2.0, "reports_success": 0}
     progress.update(row)
-    assert progress.status() == "last 1: return 2.0  largest violation none"
+    assert progress.status() == "last 1: return 2.0  largest violation unconstrained"
     progress.update(row | {"episode": 1, "reports_success": 1})
     assert progress.status().startswith("last 2: success 0%")
+
+
+def test_status_says_unconstrained_without_constraints():
+    progress = EpisodeProgress(1)
+    progress.update({"episode": 0, "success": 1, "return": 0.0, "max_commanded_violation": UNCONSTRAINED})
+    assert progress.status().endswith("largest violation unconstrained")
+    assert UNCONSTRAINED == ConstraintViolation.UNCONSTRAINED

@@ -7,13 +7,14 @@ import pytest
 import torch
 from gymnasium import spaces
 from random_episodes import OBSERVATION, check_learning_resumes, learn, make_learner
+from stable_baselines3 import DDPG
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import LEARNERS, Learner, register_learner
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
-from guiderail.tools.learning.off_policy import TD3_NOISE
+from guiderail.tools.learning.off_policy import TD3_NOISE, OffPolicyLearner
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
 ALGORITHMS = ["td3", "crossq"]
@@ -34,8 +35,10 @@ def test_exported_policy_acts_as_the_model(algorithm):
     np.testing.assert_allclose(learner.policy({"observation_shape": [3]})(OBSERVATION), expected, atol=1e-6)
 
 
-def test_td3_explores_with_noise():
-    learner = make_learner(resolve_preset(None, "td3", OFF_POLICY))
+@pytest.mark.parametrize("algorithm", ["td3", "ddpg"])
+def test_deterministic_policy_explores_with_noise(algorithm, monkeypatch):
+    monkeypatch.setitem(LEARNERS._entries, "ddpg", type("Ddpg", (OffPolicyLearner,), {"algorithm": DDPG}))
+    learner = make_learner(resolve_preset(None, algorithm, OFF_POLICY))
     actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
     np.testing.assert_allclose(actions.std(axis=0), TD3_NOISE, atol=0.02)
     assert np.abs(actions).max() <= 1.0
@@ -164,6 +167,27 @@ def test_stored_attributes_are_the_state_of_a_learner():
     assert not first.has_diverged()
     first.best[0] = np.nan
     assert first.has_diverged()
+    Stored.stored = ("best", "hihgest")
+    with pytest.raises(InputError, match="Stored has no attribute 'hihgest', which it names in stored"):
+        first.state()
     Stored.stored = None
     with pytest.raises(InputError, match="Stored names nothing in stored"):
         first.state()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"on_step": lambda self, observation, reward: None},
+            r"on_step of Wrong must have the parameters \(self, trans",
+        ),
+        (
+            {"policy": lambda self: None},
+            r"policy of Wrong must have the parameters \(self, description\), not \(self\)",
+        ),
+    ],
+)
+def test_learner_is_refused_when_a_method_lacks_parameters(attributes, message):
+    with pytest.raises(InputError, match=message):
+        register_learner("wrong")(type("Wrong", (Stored,), attributes))

@@ -453,9 +453,9 @@ def test_failure_of_a_learner_of_a_user_is_named(method, episodes, bead_config, 
         pass
 
     def fail(self, *arguments):
-        if method != "state" or self.episodes == 3:
+        if method == "restore" or self.episodes == (3 if method == "state" else 5):
             raise AttributeError("no weights")
-        return SacLearner.state(self)
+        return getattr(SacLearner, method)(self, *arguments)
 
     monkeypatch.setitem(LEARNERS._entries, "own", Own)
     monkeypatch.setattr(trainer, "MAX_SAVING_FRACTION", 1e9)
@@ -470,3 +470,15 @@ def test_failure_of_a_learner_of_a_user_is_named(method, episodes, bead_config, 
     assert len(folder.episodes()) == episodes
     assert len(run_training(folder, config, resume=True)) == 5
     assert (folder.path / "policy.json").is_file()
+
+
+@pytest.mark.parametrize("method", ["state", "policy"])
+def test_failure_of_a_learner_is_found_before_the_first_episode(method, bead_config, tmp_path, monkeypatch):
+    def fail(self, *arguments):
+        raise AttributeError("no weights")
+
+    monkeypatch.setitem(LEARNERS._entries, "own", type("Own", (SacLearner,), {method: fail}))
+    config = replace(bead_config, learner=replace(bead_config.learner, algorithm="own"))
+    with pytest.raises(InputError, match=rf"Own\.{method} failed: .*AttributeError: no weights"):
+        run_training(RunFolder(tmp_path / "run"), config)
+    assert not (tmp_path / "run").exists()
