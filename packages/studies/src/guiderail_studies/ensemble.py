@@ -15,8 +15,8 @@ from guiderail.tools.pretrained import find_run
 def write_ensemble(runs: Sequence[str | Path], out: Path, search: Mapping[str, Any] | None = None) -> Ensemble:
     """Write the mean of several runs' policies as a run folder with the configuration of the first run.
 
-    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run. `search` are the arguments of
-    a `RimSearch`; None for none.
+    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run. `search` has the arguments
+    of a `RimSearch`; None for none.
     """
     if len(runs) < 2:
         raise InputError("an ensemble has the policies of several runs: name at least two")
