@@ -61,7 +61,11 @@ class Observed:
 
     @classmethod
     def of(cls, declared: Sequence[ObservationTerm] | Observed) -> Observed:
-        """Return what `Task.observe` declares, which may be a list of terms."""
+        """Return what `Task.observe` declares, which may be a list of terms.
+
+        Raises:
+            InputError: If an entry is no `ObservationTerm`.
+        """
         observed = declared if isinstance(declared, Observed) else cls(declared)
         for term in (*observed.terms, *observed.privileged):
             if not isinstance(term, ObservationTerm):

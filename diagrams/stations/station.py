@@ -357,6 +357,9 @@ class JointStation(Station):
 
     Attributes:
         plant_step: Time step of the plant [s]; the control period is a multiple of it.
+
+    Raises:
+        InputError: If `add_robot` returns no model, or a joint has no actuator with PD gains.
     """
 
     plant_step: ClassVar[float] = PLANT_PERIOD
@@ -385,7 +388,11 @@ class JointStation(Station):
         self.finish(builder, desired.get_input_port(), pose=positions.get_output_port(), **forces)
 
     def add_robot(self, plant: MultibodyPlant, workcell: Any) -> ModelInstanceIndex:
-        """Add joints with PD gains, and what surrounds them, to the plant; return the model of the joints."""
+        """Add joints with PD gains, and what surrounds them, to the plant; return the model of the joints.
+
+        Raises:
+            InputError: Unless a subclass overrides this method.
+        """
         raise InputError(f"{type(self).__name__} needs a method add_robot(plant, workcell)")
 
 

@@ -187,6 +187,7 @@ def test_simulated_driver_exits_when_the_parent_is_killed():
 
 def start_child(connection):
     """Start a child whose standard output is a connection, and wait."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in background jobs
     os.dup2(connection.fileno(), 1)
     with subprocess_tied_to_parent("import time; time.sleep(60)"):
         connection.send("started")
