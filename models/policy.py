@@ -246,7 +246,8 @@ class RimSearch:
         cycles: Cycles in an episode of the action's first and second entry.
 
     Raises:
-        ValueError: If a number is missing, not finite, or not of this kind.
+        TypeError: If an argument is missing or no number.
+        ValueError: If a number is not finite, an entry is negative, or there are not two numbers of cycles.
     """
 
     time: int
@@ -260,12 +261,8 @@ class RimSearch:
         numbers = (self.above, self.after, self.amplitude, *self.cycles)
         if any(type(entry) is not int or entry < 0 for entry in (self.time, self.height)) or len(self.cycles) != 2:
             raise ValueError("a search has entries of the observation, and two numbers of cycles")
-        if not np.isfinite(np.array(numbers, float)).all():
+        if not all(map(math.isfinite, numbers)):
             raise ValueError("the numbers of a search must be finite")
-
-    def fits(self, shape: tuple[int, ...]) -> bool:
-        """Return True if observations of a shape have the entries."""
-        return len(shape) == 1 and max(self.time, self.height) < shape[0]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return what is added to the first two entries of the action, (2,)."""
@@ -299,10 +296,10 @@ class Ensemble(Policy):
         search = self.description.get("search")
         self._search = None if search is None else RimSearch(**search)
         self._low, self._high = first._low, first._high
-        if self._search is not None and (
-            len(self._low) < 2 or first._image_shape is not None or not self._search.fits(first._shape)
-        ):
-            raise ValueError("a search moves two entries of an action, by entries of a vector that is observed")
+        if self._search is not None:
+            is_vector, last = len(first._shape) == 1, max(self._search.time, self._search.height)
+            if len(self._low) < 2 or not is_vector or last >= first._shape[0]:
+                raise ValueError("a search moves two entries of an action, by entries of a vector that is observed")
 
     @property
     def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:

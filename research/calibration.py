@@ -5,7 +5,8 @@
 Robots are draws of the prior. Every draw is also a hidden robot: its posterior is fitted to the draws of the other
 folds. With `--remedied`, training of RUN, a run with a checkpoint, continues on draws of the posterior of robots in
 Drake on which the policy loses at least `LOSS`. The simulations are stored in DIR, so that the same command resumes.
-The table is DIR/calibration.csv, and DIR/robots.csv has a row for each robot whose success is predicted.
+The table is DIR/calibration.csv, and DIR/robots_drake.csv and DIR/robots_mujoco.csv have a row for each robot whose
+success is predicted.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def test_search_moves_a_workpiece_that_stays_on_the_rim(tmp_path):
     "changed",
     [
         {"time": 3}, {"height": -1}, {"time": 0.0}, {"amplitude": float("nan")}, {"cycles": [1.0]}, {"unknown": 1},
-        {"after": "soon"},
+        {"after": "0.3"},
     ],
 )  # fmt: skip
 def test_searches_that_do_not_fit_are_refused(tmp_path, changed):
