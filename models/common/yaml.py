@@ -48,9 +48,17 @@ def load_yaml(path: str | Path, what: str = "file") -> Any:
         InputError: As `parse_yaml`, or if the file cannot be read or is not in UTF-8.
     """
     path = Path(path)
-    data = read_bytes(path, what, MAX_SIZE)
+    return parse_content(read_bytes(path, what, MAX_SIZE), path, what)
+
+
+def parse_content(content: bytes, path: Path, what: str = "file") -> Any:
+    """Read the content of a YAML file as `load_yaml`.
+
+    Raises:
+        InputError: As `parse_yaml`, or if the content is not in UTF-8.
+    """
     try:
-        text = data.decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the {what} '{path}' can't be read: it is not text in UTF-8") from error
     return parse_yaml(text, str(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -23,10 +23,10 @@ from guiderail.diagrams.tasks.options import (
     reference_of_file,
 )
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import write_atomically
+from guiderail.models.common.files import read_bytes, write_atomically
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.common.yaml import load_yaml
+from guiderail.models.common.yaml import MAX_SIZE, parse_content
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.demonstrations import phases_of_steps
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
@@ -419,19 +419,24 @@ def read_task_file(folder: Path) -> PartTaskFile:
         raise InputError(f"there is no task folder {folder}: restore it, or create it with guiderail create-task")
     if not path.is_file():
         raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail create-task makes one")
-    data = load_yaml(path, "task")
-    if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
-        raise InputError(f"{path} is no task: it must contain the line 'format: {FILE_FORMAT}'")
-    try:
-        file = validate_options(PartTaskFile, data, "it")
-    except InputError as error:
-        raise InputError(f"{path} is invalid: {error}") from None
+    file = _parse(path, read_bytes(path, "task", MAX_SIZE))
     for name in file.files:
         if not is_plain_path(name):
             raise InputError(f"{path} names {brief(name)}, which is not a plain path inside {folder}: rename the file")
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or create the task again")
     return file
+
+
+@lru_cache(maxsize=256)  # a command reads each of its tasks several times, and 40 ms of a core parse one
+def _parse(path: Path, content: bytes) -> PartTaskFile:
+    data = parse_content(content, path, "task")
+    if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
+        raise InputError(f"{path} is no task: it must contain the line 'format: {FILE_FORMAT}'")
+    try:
+        return validate_options(PartTaskFile, data, "it")
+    except InputError as error:
+        raise InputError(f"{path} is invalid: {error}") from None
 
 
 def task_folder_digest(folder: Path) -> str:
