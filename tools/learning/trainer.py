@@ -128,10 +128,8 @@ def run_training(
             if config.learner.num_envs:
                 raise InputError("callbacks need the episodes in this process: leave num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
-        if not resume and not LEARNERS.is_packaged(config.learner.algorithm):
-            first = TrainingLoop(folder, learner, episodes)
-            first.learner_state()  # an error in one of these methods must not cost the run
-            first.learner_policy()
+        if not resume:
+            TrainingLoop(folder, learner, episodes).check_learner()
         stack.enter_context(folder.locked())
         if config.learner.num_envs:
             episodes = ActorEpisodes(episodes, learner)
@@ -192,6 +190,12 @@ class TrainingLoop:
         self.remaining: list[Callable[[], None]] = []
         self._num_restored = 0
         self._last_saving_time = 0.0
+
+    def check_learner(self) -> None:
+        """Call the methods of another package's learner that are not needed until later, so that no run is lost."""
+        if not LEARNERS.is_packaged(self._episodes.config.learner.algorithm):
+            self.learner_state()
+            self.learner_policy()
 
     def run(self, *, resume: bool = False) -> list[Row]:
         """Run all episodes and save the policy; return the rows. With `resume`, continue from the checkpoint."""

@@ -24,6 +24,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.off_policy import OffPolicyLearner
 from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.models.joint_status import Fault
@@ -174,6 +176,17 @@ def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path,
     assert table["episode"].tolist() == [0, 1, 2, 3]
     assert [row["episodes_known"] for row in rows] == [0, 0, 1, 2]
     assert len(read_step_log(folder.steps)) == 40
+
+
+def test_learner_of_another_package_is_checked_before_an_episode(env, monkeypatch, tmp_path, forkserver):
+    monkeypatch.setattr(LEARNERS, "is_packaged", lambda name: False)
+    monkeypatch.setattr(OffPolicyLearner, "policy", lambda learner, description: 1 / 0)
+    monkeypatch.setattr(env, "step", lambda action: pytest.fail("the arm moved"))
+    settings = {"net_arch": (8, 8), "batch_size": 1}
+    environment = {"station": "arm", "guidance": "kgrl"}
+    config = configure("BncConnector", environment, algorithm="sac", episodes=1, settings=settings)
+    with pytest.raises(InputError, match=r"Learner\.policy.*ZeroDivisionError"):
+        _train(RunFolder(tmp_path), config, env, waits=True, report=lambda row: None)
 
 
 def test_operator_stop_truncates_and_reset_resumes(env, monkeypatch):

@@ -198,6 +198,8 @@ def _train(
             loop.save_policy()
 
     try:
+        if not resume:
+            TrainingLoop(folder, acting, episodes).check_learner()
         learner.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
         return loop.run(resume=resume)
