@@ -247,6 +247,39 @@ def test_finer_contact_transfers_to_mujoco_and_other_frictions():
         assert (rows_of(f"{fine}_transfer", method)["max_commanded_violation"] <= TOLERANCE).all()
 
 
+def test_policies_of_the_gantry_transfer_to_mujoco_and_arms():
+    gantry, arms = "connector_hard_gantry", ("iiwa", "Panda", "UR5e")
+    assert success_range(gantry, ["kgrl"], "MuJoCo") == (77, 99)
+    assert success_range(gantry, ["kgrl"], *arms) == (77, 100)
+    assert success_range(gantry, ["scripted"], "MuJoCo") == (89, 89)
+
+
+def test_random_actions_seldom_lock_the_connector_when_hard():
+    assert success_percent("connector_hard_converged", "uniform_random") == [7]
+
+
+def test_covariance_without_constraints_leaves_the_passage():
+    """In held-out episodes; the largest violation in training is 73 mm."""
+    rows = rows_of("peers_narrow_passage_hard", "residual_covariance")
+    assert rows["success_rate"].tolist() == rows_of("peers_narrow_passage_hard", "kgrl")["success_rate"].tolist()
+    assert rows["violating_episodes"].sum() == 610
+    assert 1000 * rows["max_commanded_violation"].max() == pytest.approx(71, abs=0.5)
+
+
+def test_force_shortens_episodes_without_force_bound():
+    rows = {method: rows_of("peers_grid_clamp_hard_unbounded", method) for method in ("sct", "residual", "crossq")}
+    steps = {method: rows_of_method["training_total_steps"].mean() for method, rows_of_method in rows.items()}
+    assert steps == pytest.approx({"sct": 7800, "residual": 1200, "crossq": 1200}, abs=50)
+
+
+def test_skill_in_engines_stays_below_the_force_limit():
+    table = read_table(RESULTS / "engines.csv")
+    policies = table[table["method"] != "uniform_random"]
+    assert policies["peak_force"].max() == pytest.approx(15.9, abs=0.05)
+    assert sorted(policies["peak_contact_force"])[-2:] == pytest.approx([18.4, 36.5], abs=0.05)
+    assert policies["training_collisions"].sum() == 0
+
+
 def sweep_success(study, method, quantity, value):
     """Return the success rate of all seeds of a method together, at a value of the varied quantity [%]."""
     rows = rows_of(study, method, f"{quantity} {value}")
@@ -344,7 +377,7 @@ def test_skgrl_reduces_jerk_as_stated():
             )
             ratios[study, name] = kgrl / skgrl if name == "measured_linear" else skgrl / kgrl
     measured = [ratio for (_, name), ratio in ratios.items() if name == "measured_linear"]
-    assert (min(measured), max(measured)) == pytest.approx((1.5, 2.2), abs=0.06)
+    assert (min(measured), max(measured)) == pytest.approx((1.5, 2.1), abs=0.05)
     angular = [ratios[study, "commanded_angular"] for study in ("connector_hard", "connector_hard_safety")]
     assert angular == pytest.approx([3.4, 2.8], abs=0.05)
 
