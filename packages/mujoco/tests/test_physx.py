@@ -56,15 +56,15 @@ def test_hull_with_too_many_vertices_is_refused(engine):
         engine._shape(replace(surface, shape=larger))
 
 
-@pytest.mark.parametrize("displacement", [1e11, 1e300])
-def test_divergence_ends_the_episode(displacement):
+def test_divergence_ends_the_episode():
     env = make_env("BncConnector", station="sapien", action_repeat=5)
-    env.reset(seed=3)
-    env.step(np.zeros(2))
-    env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
-    *_, terminated, truncated, info = env.step(np.zeros(2))
-    assert (terminated, truncated) == (False, True)
-    assert "the simulation failed in PhysX" in info["simulation_failure"]
+    for displacement in (1e11, 1e300):
+        env.reset(seed=3)
+        env.step(np.zeros(2))
+        env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
+        *_, terminated, truncated, info = env.step(np.zeros(2))
+        assert (terminated, truncated) == (False, True)
+        assert "the simulation failed in PhysX" in info["simulation_failure"]
 
 
 def test_body_has_the_mass_of_tool_and_workpiece(engine):

@@ -54,8 +54,8 @@ class RigidEngine(ABC):
     use the contacts of the last update.
     """
 
-    name: ClassVar[str]  # name in messages
-    station: ClassVar[str]  # name of the station
+    name: str  # name in messages
+    station: str  # name of the station
 
     def __init__(
         self,
