@@ -75,6 +75,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "learn": {"torch": "PyTorch", "stable_baselines3": "Stable-Baselines3", "sb3_contrib": "sb3-contrib"},
     "mujoco": {"mujoco": "MuJoCo"},
     "pybullet": {"pybullet": "PyBullet"},
+    "sapien": {"sapien": "SAPIEN"},
     "parts": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
     "repair": {"pytetwild": "pytetwild", "pyvista": "PyVista"},
     "bags": {"rosbags": "rosbags"},

@@ -33,7 +33,7 @@ SIBLINGS = {
     "data": ("dataset", "template"),
     "lerobot": ("learner:bc", "learner:chunk", "learner:distillation", "guidance:base_policy",
                 "guidance:kgrl_base_policy", "guidance:residual_base_policy"),
-    "mujoco": ("station:mujoco", "station:pybullet"),
+    "mujoco": ("station:mujoco", "station:pybullet", "station:sapien"),
     "cpp": ("export",),
     "calibration": ("calibrate", "probe"),
 }  # fmt: skip

@@ -20,6 +20,7 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from guiderail_mujoco.bullet import BulletStation
+from guiderail_mujoco.physx import PhysxStation
 from guiderail_mujoco.station import MujocoContact, MujocoStation, constraint_torques, mujoco_parts
 from guiderail_mujoco.surfaces import surfaces_of
 
@@ -286,7 +287,9 @@ def test_station_raises_when_surfaces_are_missing():
         MujocoStation(WorkcellWithoutSurfaces())
 
 
-@pytest.mark.parametrize(("station", "engine"), [(MujocoStation, "mujoco"), (BulletStation, "pybullet")])
+@pytest.mark.parametrize(
+    ("station", "engine"), [(MujocoStation, "mujoco"), (BulletStation, "pybullet"), (PhysxStation, "sapien")]
+)
 def test_station_raises_when_its_engine_is_missing(station, engine, monkeypatch):
     monkeypatch.setitem(sys.modules, engine, None)
     with pytest.raises(InputError, match=rf'pip install "guiderail\[{engine}\]"'):

@@ -44,7 +44,7 @@ def test_conditions_are_steps_and_changes_of_each_engine():
 
 @pytest.mark.parametrize("engines", ["drake,bullet", "", "drake,drake"])
 def test_conditions_raise_for_wrong_engines(engines):
-    with pytest.raises(InputError, match="--engines are drake, mujoco, pybullet"):
+    with pytest.raises(InputError, match="--engines are drake, mujoco, pybullet, sapien"):
         passport_conditions("BncConnector", HARD, engines, lambda sentence: None)
 
 

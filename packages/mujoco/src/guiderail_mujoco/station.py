@@ -141,7 +141,7 @@ def contact_masks(surfaces: Sequence[Surface], first_bit: int = 0) -> dict[str, 
     """Return a contact mask of one bit for each pair of surfaces, by the name of the pair."""
     pairs = sorted({surface.pair for surface in surfaces})
     if len(pairs) > (most := MAX_PAIRS - first_bit):
-        raise InputError(f"MuJoCo distinguishes at most {most} pairs of surfaces, and the workcell has {len(pairs)}")
+        raise InputError(f"the engines distinguish at most {most} pairs of surfaces, and the workcell has {len(pairs)}")
     return {pair: 1 << bit for bit, pair in enumerate(pairs, first_bit)}
 
 

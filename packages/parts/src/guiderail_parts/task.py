@@ -570,7 +570,7 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
     members = {
         "name": file.name,
         "scripted_policies": (ScriptedSearch(file, lambda: reference().num_steps * CONTROL_PERIOD),),
-        "unsupported_stations": () if file.is_convex else ("mujoco", "pybullet"),  # these need convex pieces
+        "unsupported_stations": () if file.is_convex else ("mujoco", "pybullet", "sapien"),  # these need convex pieces
         "presets": {"hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
         "digest": content,

@@ -135,7 +135,7 @@ def robustness(
 def converge(
     run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
     steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
-    engines: Annotated[str, option("Engines: drake, mujoco and pybullet, comma-separated.")] = "drake",
+    engines: Annotated[str, option("Engines: drake, mujoco, pybullet and sapien, comma-separated.")] = "drake",
     episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
     seed: cli.Seed = cli.SEED,
     env: cli.Env = None,
@@ -182,7 +182,7 @@ def passport(
     run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
     engines: Annotated[
         str | None,
-        option("Engines: drake, mujoco and pybullet, comma-separated.  [default: those that are installed]"),
+        option("Engines: drake, mujoco, pybullet and sapien, comma-separated.  [default: those that are installed]"),
     ] = None,
     episodes: Annotated[int, option("Number of held-out episodes of each condition.")] = 20,
     seed: cli.Seed = cli.SEED,

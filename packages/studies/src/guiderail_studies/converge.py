@@ -21,7 +21,7 @@ from guiderail.tools.evaluation.subject import Subject, find_subject
 from guiderail.tools.tables import write_table
 
 STEPS = (10.0, 5.0, 2.5, 1.25)  # default plant steps in Drake [ms]
-ENGINES = {"drake": "Drake", "mujoco": "MuJoCo", "pybullet": "Bullet"}  # label of each engine
+ENGINES = {"drake": "Drake", "mujoco": "MuJoCo", "pybullet": "Bullet", "sapien": "PhysX"}  # label of each engine
 ARM_OPTIONS = ("robot", "end_effector", "impedance_control")  # options that the stations of other engines lack
 EPISODES = 40  # default number of episodes of each condition
 MAX_DIFFERENCE = 0.05  # largest difference of success rates between a step and the finest one that agrees with it
@@ -135,7 +135,7 @@ def converge(
     Args:
         policy: Run, or `pretrained:NAME`.
         steps: Plant steps in Drake [ms].
-        engines: "drake", "mujoco" and "pybullet", comma-separated.
+        engines: "drake", "mujoco", "pybullet" and "sapien", comma-separated.
         episodes: Number of held-out episodes of each condition, with the same seeds.
         seed: Seed of the first episode.
         environment: Options of the environment that differ from training.

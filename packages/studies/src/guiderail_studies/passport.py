@@ -28,7 +28,8 @@ from guiderail_studies.converge import (
 from guiderail_studies.robustness import points, select_axes
 
 EPISODES = 20  # default number of episodes of each condition
-DIVISIONS = {"drake": (1, 2, 4), "mujoco": (1, 2), "pybullet": (1, 2)}  # divisors of each engine's default step
+# Divisors of each engine's default step.
+DIVISIONS = {"drake": (1, 2, 4), "mujoco": (1, 2), "pybullet": (1, 2), "sapien": (1, 2)}
 ENGINE_STEP = 1.0  # default step of the engines other than Drake [ms]
 CHANGES = {"friction": (0.5, 2.0), "clearance": (0.5,)}  # values of the axes of `robustness`, at the default step
 
@@ -93,7 +94,7 @@ def passport(
 
     Args:
         policy: Run, or `pretrained:NAME`.
-        engines: "drake", "mujoco" and "pybullet", comma-separated; None for those that are installed.
+        engines: "drake", "mujoco", "pybullet" and "sapien", comma-separated; None for those that are installed.
         episodes: Number of held-out episodes of each condition, with the same seeds.
         seed: Seed of the first episode.
         environment: Options of the environment that differ from training.
