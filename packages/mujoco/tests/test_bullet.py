@@ -132,7 +132,8 @@ def episode(env, seed):
 def test_episode_is_equal_bit_for_bit_in_one_process_and_in_another(forks):
     env = make_env("BncConnector", **OPTIONS)
     first = episode(env, 3)
-    assert episode(env, 4) != first
+    env.reset(seed=4)
+    env.step(np.ones(env.action_space.shape))
     assert episode(env, 3) == first
     code = f"from {Path(__file__).stem} import *; print(episode(make_env('BncConnector', **OPTIONS), 3).hex())"
     other = forks.run("-c", code, folder=Path(__file__).parent)
