@@ -63,9 +63,9 @@ def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
 def test_resumed_student_is_that_of_an_uninterrupted_run(teacher, tmp_path):
     settings = SETTINGS | {"teacher": str(teacher), "gradient_steps": 20}
     arguments = {"seed": 1, "algorithm": "distillation", "pictures": False, "settings": settings, **OPTIONS}
-    whole = train("NarrowPassage", out=tmp_path / "whole", episodes=2, **arguments)
-    parts = train("NarrowPassage", out=tmp_path / "parts", episodes=1, **arguments)
-    resumed = train("NarrowPassage", out=parts.path, resume=True, episodes=2, pictures=False)
+    whole = train("NarrowPassage", out=tmp_path / "whole", episodes=3, **arguments)
+    parts = train("NarrowPassage", out=tmp_path / "parts", episodes=2, **arguments)
+    resumed = train("NarrowPassage", out=parts.path, resume=True, episodes=3, pictures=False)
     assert (whole.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 
