@@ -8,6 +8,8 @@ import pytest
 from fork_server import Forks, start_forkserver
 from hypothesis import HealthCheck, settings
 
+from guiderail.tools.evaluation import forks as evaluation_forks
+
 COMMON = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
 settings.register_profile("quick", max_examples=30, derandomize=True, **COMMON)
@@ -59,7 +61,12 @@ def pytest_collection(session):
 
 
 def pytest_collection_finish(session):
-    """Start the fork servers after the imports of all tests and before the first fixture."""
+    """Start the fork servers after the imports of all tests and before the first fixture.
+
+    From then on, episodes are evaluated in this process unless a test gives a number of processes: a fork of a process
+    that has imported everything takes longer than a short episode.
+    """
+    evaluation_forks.num_cores = lambda: 1
     gc.freeze()  # excludes imported objects from garbage collections, which saves a fifteenth of the run time
     gc.set_threshold(10_000)  # fewer collections, each of which traverses what the tests have left
     gc.enable()

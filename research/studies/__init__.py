@@ -26,9 +26,3 @@ def study_path(name: str) -> Path:
     if not path.is_file():
         raise InputError(f"there is no study {name!r}: {did_you_mean(name, study_names())}")
     return path
-
-
-def study_command_line(name: str) -> str:
-    """Return the command that runs a study of this folder from the root of a checkout."""
-    trust = " --trust-imports" if "\nimports:" in study_path(name).read_text(encoding="utf-8") else ""
-    return f"guiderail study research/studies/{name}.yaml --out studies{trust}"

@@ -1,5 +1,6 @@
 """Systems that Drake can convert to other scalar types, and the derivatives of an impedance."""
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
             """
 
 else:
-
-    @TemplateSystem.define("ConvertibleSystem_")
+    # Without `scope`, Drake reads the source of every calling frame to find this module, which takes half a second.
+    @TemplateSystem.define("ConvertibleSystem_", scope=sys.modules[__name__])
     def ConvertibleSystem_(T):
         """Return the class of numbers of type `T`."""
 

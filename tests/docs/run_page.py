@@ -116,12 +116,17 @@ def shorten_pictures() -> None:
 
 
 def shorten_create_task() -> None:
-    """Shorten what no page shows: contact map, size of the mixture, episodes of the calibration, speed of a contact."""
+    """Shorten what no page shows: contact map, size of the mixture, pieces for MuJoCo, one of two misaligned trials.
+
+    Also leave out the episodes of the calibration, and the choice of a contact by its speed.
+    """
     with contextlib.suppress(ImportError):  # guiderail-parts is missing
         from guiderail.models.primitives import mixture
-        from guiderail_parts import contact, contact_map, difficulty
+        from guiderail_parts import contact, contact_map, create_task, difficulty, trial
 
         contact_map.TOUCHES, contact.MIN_SPEED = 4, 0.0
+        contact.MISALIGNMENTS = create_task.MISALIGNMENTS = contact.MISALIGNMENTS[:1]
+        trial.add_convex_pieces = lambda folder, file, *_: file
         mixture._MAX_COMPONENTS = 4
         difficulty.score_setting = lambda *_: difficulty.Score(0, 1, 1, 1)
 

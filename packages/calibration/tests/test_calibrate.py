@@ -1,5 +1,4 @@
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -21,16 +20,19 @@ from guiderail_calibration.summaries import summarize
 RUN, GANTRY = "pretrained:connector", {"station": "gantry"}
 
 
+def record(folder, environment, episodes):
+    """Write a probing motion, and recordings of episodes of it on a stiff robot; return the folder."""
+    record_options(RUN, environment, folder / "probe.npz")
+    config = find_subject(RUN, None).config
+    base = changed_environment(config.task, config.environment, environment)
+    robot = {**base, **probe_options(folder / "probe.npz", base), "disturbances.stiffness_factor": 1.7}
+    evaluate("zero", config.task, episodes, environment=robot, baselines=(), processes=1, steps=folder / "recordings")
+    return folder
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Return a folder with a probing motion and with recordings of two episodes of it on a stiff robot."""
-    folder = tmp_path_factory.mktemp("calibration")
-    record_options(RUN, GANTRY, folder / "probe.npz")
-    config = find_subject(RUN, None).config
-    base = changed_environment(config.task, config.environment, GANTRY)
-    robot = {**base, **probe_options(folder / "probe.npz", base), "disturbances.stiffness_factor": 1.7}
-    evaluate("zero", config.task, 2, environment=robot, baselines=(), processes=1, steps=folder / "recordings")
-    return folder
+    return record(tmp_path_factory.mktemp("calibration"), GANTRY, 2)
 
 
 def test_probing_motion_presses_within_the_force_limit(recorded):
@@ -65,21 +67,21 @@ def test_summaries_tell_robots_apart_more_than_episodes(recorded):
     assert a.shape == b.shape
 
 
-def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
-    # One recorded episode, few draws of one episode each, and one flow: more are for coverage, not tested here.
-    first = min((recorded / "recordings").glob("*.parquet"))
-    (recorded / "one").mkdir()
-    shutil.copy(first, recorded / "one")
+def test_calibration_is_resumed_and_writes_its_files(tmp_path, monkeypatch):
+    # One recorded episode, few draws of one episode each, and one flow: more are for coverage, not tested here. With
+    # the coarse time step, the motion shows the stiffness but does not enter the hole.
+    coarse = GANTRY | {"time_step": 0.01}
+    recordings = record(tmp_path, coarse, 1) / "recordings"
     monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", 1)
     monkeypatch.setattr("guiderail_calibration.calibrate.MIN_DRAWS", 12)
     monkeypatch.setattr("guiderail_calibration.calibrate.EPISODES_OF_PREDICTION", 1)
     monkeypatch.setattr("guiderail_calibration.inference.MEMBERS", 1)
     sentences = []
     arguments = {
-        "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 12,
-        "predicted": 1, "out": recorded / "out", "processes": 1, "log": sentences.append,
+        "probe": tmp_path / "probe.npz", "environment": coarse, "parameters": ["stiffness"], "draws": 12,
+        "predicted": 1, "out": tmp_path / "out", "processes": 1, "log": sentences.append,
     }  # fmt: skip
-    result = calibrate(RUN, recorded / "one", **arguments)
+    result = calibrate(RUN, recordings, **arguments)
     (row,) = result["parameters"]
     assert row["identifiable"] == "yes"
     # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 12 draws.
@@ -92,19 +94,19 @@ def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
     stored = load_variants(result["variants"])
     assert len(stored) == 10
     assert all(0.5 <= variant["disturbances.stiffness_factor"] <= 2.0 for variant in stored.values())
-    page = (recorded / "out" / "calibration.html").read_text()
+    page = (tmp_path / "out" / "calibration.html").read_text()
     assert "impedance stiffness (factor)" in page
     assert page.count("<svg") == 2
-    assert json.loads((recorded / "out" / "calibration.json").read_text())["parameters"] == result["parameters"]
-    assert yaml.safe_load((recorded / "out" / "variants.yaml").read_text())
+    assert json.loads((tmp_path / "out" / "calibration.json").read_text())["parameters"] == result["parameters"]
+    assert yaml.safe_load((tmp_path / "out" / "variants.yaml").read_text())
 
     def refuse(*_):
         raise AssertionError("simulated again")
 
-    episodes = load_recordings(recorded / "one")  # on the page, in place of simulated ones
+    episodes = load_recordings(recordings)  # on the page, in place of simulated ones
     monkeypatch.setattr(Simulator, "simulate", lambda *_: (episodes, []))
     monkeypatch.setattr("guiderail_calibration.simulations._write", refuse)
-    again = calibrate(RUN, recorded / "one", **arguments)
+    again = calibrate(RUN, recordings, **arguments)
     assert again["parameters"] == result["parameters"]
 
 

@@ -19,30 +19,32 @@ OPTIONS = {"action_repeat": 10, "difficulty": "hard"}
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    out = tmp_path_factory.mktemp("chunk") / "run"
-    arguments = {"episodes": 4, "seed": 3, "algorithm": "chunk", "settings": SETTINGS, "pictures": False}
-    return train("NarrowPassage", "kgrl", out=out, **arguments, **OPTIONS), arguments
+    return train_chunks(tmp_path_factory.mktemp("chunk") / "run")
+
+
+def train_chunks(out, **settings):
+    """Return the run of a base policy that is trained on four demonstrations."""
+    arguments = {"episodes": 4, "seed": 3, "algorithm": "chunk", "settings": SETTINGS | settings, "pictures": False}
+    return train("NarrowPassage", "kgrl", out=out, **arguments, **OPTIONS)
 
 
 def test_chunks_follow_the_commands_of_the_demonstrations(trained):
-    run, _ = trained
     env = make_environment("NarrowPassage", {"guidance": "kgrl", **OPTIONS})
     demonstrate = make_baseline("NarrowPassage", "scripted")(env)
     observation, _ = env.reset(seed=3)
     for _ in range(8):
         observation, *_ = env.step(demonstrate(observation))
-    samples = chunk_samples(find_base_policy(str(run.path)), observation, 2)
+    samples = chunk_samples(find_base_policy(str(trained.path)), observation, 2)
     assert samples.shape == (3, 4, 2)
     env.step(demonstrate(observation))
     y = 1  # entry along the passage; demonstrations pass the obstacle on either side in x, with equal y
     assert np.abs(samples.mean(axis=0) - env.unwrapped.trace.commanded[80:84])[:, y].max() < 0.06
     assert samples.std(axis=0).max() > 0.0
-    assert run.summary["success_in_training"].startswith("only demonstrations")
+    assert trained.summary["success_in_training"].startswith("only demonstrations")
 
 
-def test_seed_determines_the_policy_also_when_resumed(trained, tmp_path):
-    run, arguments = trained
-    second = train("NarrowPassage", "kgrl", out=tmp_path / "again", **arguments, **OPTIONS)
+def test_seed_determines_the_policy_also_when_resumed(tmp_path):
+    run, second = (train_chunks(tmp_path / name, gradient_steps=20) for name in ("run", "again"))
     for path in ("policy.safetensors", "policy.json"):
         assert (run.path / path).read_bytes() == (second.path / path).read_bytes()
     for episodes in (5, 6):  # the second resume starts from a checkpoint with an episode after the demonstrations

@@ -58,9 +58,15 @@ def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
         errors.append(np.abs(chunk[0] - learner.label(observation, step)).max())
         observation, *_ = env.step(learner._teacher(observation))
     assert np.median(errors) < 0.02  # [m]; the passage is 0.9 m long
-    second = train("NarrowPassage", out=tmp_path / "again", **arguments | {"episodes": 2})
-    resumed = train("NarrowPassage", out=second.path, resume=True, episodes=3, pictures=False)
-    assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
+
+
+def test_resumed_student_is_that_of_an_uninterrupted_run(teacher, tmp_path):
+    settings = SETTINGS | {"teacher": str(teacher), "gradient_steps": 20}
+    arguments = {"seed": 1, "algorithm": "distillation", "pictures": False, "settings": settings, **OPTIONS}
+    whole = train("NarrowPassage", out=tmp_path / "whole", episodes=3, **arguments)
+    parts = train("NarrowPassage", out=tmp_path / "parts", episodes=2, **arguments)
+    resumed = train("NarrowPassage", out=parts.path, resume=True, episodes=3, pictures=False)
+    assert (whole.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 
 def test_entries_that_depend_on_the_step_alone_are_found():

@@ -172,17 +172,15 @@ def test_episode_is_bit_identical_for_the_same_seed(task):
     """An episode and a displacement of the tool in between leave no state."""
     env = make_env(task, station="mujoco", action_repeat=25, fixture_offset="per_episode")
     first = run_episode(env, 3)
-    run_episode(env, 4)
+    assert not np.array_equal(run_episode(env, 4), first)
     env.push(np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_array_equal(run_episode(env, 3), first)
-    assert not np.array_equal(run_episode(env, 4), first)
 
 
 @pytest.mark.parametrize(
     ("task", "options", "modulus_factor", "max_steps"),
     [
         ("BncConnector", {"fixture_offset": "none", "guidance": "kmp"}, 10.0, 400),
-        ("GridClamp", {}, 10.0, 100),
         ("GridClamp", {}, 30.0, 100),
     ],
     ids=lambda value: None if isinstance(value, dict) else str(value),

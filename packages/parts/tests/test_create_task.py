@@ -161,7 +161,7 @@ def test_task_of_a_study_may_be_a_task_folder(folder, tmp_path, monkeypatch):
 
 
 def test_page_shows_an_episode_of_a_created_task(folder, tmp_path):
-    call("visualize", folder, "--policy", "zero", "--html", tmp_path / "page.html")
+    call("visualize", folder, "--policy", "zero", "--episodes", 1, "--html", tmp_path / "page.html")
     assert (tmp_path / "page.html").stat().st_size > 100_000
 
 
@@ -642,6 +642,7 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     text = (other / "task.yaml").read_text()
     (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
     options = *SMALL_LEARNER, "--set", "demonstration_episodes=1", "--no-pictures", "--out", tmp_path / "run"
+    options = *options, "--env", "force_limit=1"  # an episode ends at the first contact
     call("train", folder, other, "--episodes", 2, "--evaluate", 1, *options, "--json")
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out_episodes"] == 2
     run = RunFolder(tmp_path / "run")

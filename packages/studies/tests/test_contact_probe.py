@@ -5,34 +5,32 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.station import PLANT_PERIOD
-from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag
+from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag, press_on_rim
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects import bnc_connector
-from guiderail_studies.contact_probe import ContactProbe, probe_contact
+from guiderail_studies.contact_probe import DROPPED, ContactProbe, _lever, probe_contact
 
 CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
 
-@pytest.fixture(scope="module")
-def probes():
-    """Return the connector's contact at its default step and at half of it."""
-    step = CONNECTOR.workcell().time_step
-    return [probe_contact(CONNECTOR, time_step=step / division) for division in (1, 2)]
-
-
-def test_contact_of_the_connector_has_converged_at_the_default_step(probes):
-    """Drag, lever arm and capture are those of a finer step, and the drag is the friction at both speeds."""
-    default, finer = probes
-    size = CONNECTOR.workcell().dimensions
-    assert drag(CONNECTOR.workcell(), CONNECTOR.rim_contact(), SPEEDS[0]) == default.drags[0]
-    for probe in probes:
-        assert probe.has_converged
-        assert probe.friction == bnc_connector.FRICTION
-        assert probe.capture == pytest.approx(size.bore_clearance + size.mouth_chamfer, rel=0.5)
-    assert finer.drags == pytest.approx(default.drags, rel=MAX_DRAG_ERROR)
-    assert finer.lever == pytest.approx(default.lever, rel=0.02)
-    assert finer.capture == pytest.approx(default.capture, abs=0.03 * MM)
+def test_contact_of_the_connector_has_converged_at_the_default_step():
+    """Drag, lever arm and capture are those of half the step, and the drag is the friction at both speeds."""
+    workcell, contact = CONNECTOR.workcell(), CONNECTOR.rim_contact()
+    default, finer = probe_contact(CONNECTOR), {"time_step": 0.5 * workcell.time_step}
+    assert default.has_converged
+    assert default.friction == bnc_connector.FRICTION
+    size = workcell.dimensions
+    assert default.capture == pytest.approx(size.bore_clearance + size.mouth_chamfer, rel=0.5)
+    drags = tuple(drag(workcell, contact, speed, **finer) for speed in SPEEDS)
+    on_rim, drops, stays = (
+        press_on_rim(workcell, contact, [(offset, 0.0)], "gantry", finer)[0]
+        for offset in (contact.radius, default.capture - 0.03 * MM, default.capture + 0.03 * MM)
+    )
+    assert ContactProbe(default.friction, drags, 0.0, 0.0).has_converged
+    assert drags == pytest.approx(default.drags, rel=MAX_DRAG_ERROR)
+    assert _lever(on_rim) == pytest.approx(default.lever, rel=0.02)
+    assert drops["pose"][-1, 2] < contact.height - DROPPED < stays["pose"][-1, 2]
 
 
 def test_drag_of_the_clamp_is_its_friction_at_20_mm_per_s():

@@ -65,7 +65,9 @@ def test_conditions_raise_for_a_step_that_does_not_divide_the_control_period():
 
 
 def test_converge_evaluates_each_step_once(tmp_path, capsys, monkeypatch):
-    options = {"steps": (10.0, 5.0), "episodes": 1, "out": tmp_path, "environment": {"station": "gantry"}}
+    # Episodes end at the first contact.
+    environment = {"station": "gantry", "bounded_force": False, "force_limit": 5.0}
+    options = {"steps": (10.0, 5.0), "episodes": 1, "out": tmp_path, "environment": environment}
     monkeypatch.setattr(contact_probe, "capture_offset", lambda *_, **options: 0.0)  # takes most of the time
     first = converge("pretrained:connector", processes=1, **options)
     assert [row["step_ms"] for row in first["rows"]] == [10.0, 5.0]

@@ -68,7 +68,9 @@ def test_task_without_contact_is_refused():
 def test_passport_evaluates_each_condition_once(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(passport_module, "DIVISIONS", {"drake": (1,)})
     monkeypatch.setattr(passport_module, "CHANGES", {})
-    options = {"engines": "drake", "episodes": 1, "out": tmp_path, "environment": {"station": "gantry"}, "processes": 1}
+    # Episodes end at the first contact.
+    environment = {"station": "gantry", "bounded_force": False, "force_limit": 5.0}
+    options = {"engines": "drake", "episodes": 1, "out": tmp_path, "environment": environment, "processes": 1}
     first = passport("pretrained:connector", **options)
     (row,) = first["rows"]
     assert row["condition"] == first["weakest"] == "Drake, 5 ms"

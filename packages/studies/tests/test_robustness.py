@@ -198,7 +198,7 @@ def test_only_the_offset_axis_resamples_hidden_offsets(fixture_offset, is_resamp
 
 def test_all_policies_are_evaluated_at_the_same_offsets(bead_config, tmp_path, monkeypatch):
     # Episodes end at the first contact.
-    short = {"action_repeat": 25, "bounded_force": False, "force_limit": 5.0}
+    short = {"action_repeat": 25, "bounded_force": False, "force_limit": 5.0, "time_step": 0.01}
     environment = check_environment("BncConnector", {"fixture_offset": "per_run", "guidance": "kgrl", **short})
     config = replace(bead_config, task="BncConnector", environment=environment)
     sampled = {"policy": [], "uniform_random": []}

@@ -35,7 +35,7 @@ def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
         assert any(words in message for words in REQUIREMENTS.values()), message
         assert "\n" not in message
         return
-    env = make_env(task, guidance=guidance, action_repeat=10)
+    env = make_env(task, guidance=guidance, action_repeat=2)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=0)
     assert not info["fallback"]

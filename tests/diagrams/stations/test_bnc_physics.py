@@ -17,12 +17,8 @@ from oracles.connector import insert_and_lock
 STIFFNESS = 1500.0  # of the station's translations [N/m]
 HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 WORKCELL, HARD_WORKCELL = BncWorkcell(), HARD.workcell()
-# Workcell, time step and largest force while the plug is locked [N].
-CASES = {
-    "standard": (WORKCELL, None, 15.0),
-    "hard": (HARD_WORKCELL, None, HARD.collision.above),
-    "hard at half the time step": (HARD_WORKCELL, HARD_WORKCELL.time_step / 2, HARD.collision.above),
-}
+CASES = {"standard": (WORKCELL, 15.0), "hard": (HARD_WORKCELL, HARD.collision.above)}
+"""Workcell, and largest force while the plug is locked [N]."""
 # Height of the lugs at the ends of the slots' straight entries, relative to the locked pose [mm].
 ENTRY_BOTTOM = (
     WORKCELL.dimensions.lug_height - WORKCELL.dimensions.entry_height - WORKCELL.dimensions.locked_height
@@ -41,13 +37,13 @@ def drive(times, z_mm, yaw_deg, case="standard", offset=0.0 * JACK):
 
     Jack and motion are moved by `offset`, a pose (6,) without rotation; the recorded poses are relative to it.
     """
-    workcell, time_step, _ = CASES[case]
+    workcell, _ = CASES[case]
     motion = poses(np.array(z_mm) * MM, np.deg2rad(yaw_deg)) + offset
 
     def move(plant, context):
         workcell.set_fixture_offset(plant, context, RigidTransform(offset[:3]))
 
-    signals = drive_along(GantryStation(workcell, time_step=time_step), times, motion, move)[1].signals
+    signals = drive_along(GantryStation(workcell), times, motion, move)[1].signals
     return signals | {"pose": signals["pose"] - offset}
 
 
@@ -75,7 +71,7 @@ def test_plug_locks_at_the_nominal_pose(case):
     final = locked["pose"][-1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
-    assert locked["impedance_force"].max() < CASES[case][2]
+    assert locked["impedance_force"].max() < CASES[case][1]
     assert case != "standard" or not locked["saturation"].any()
 
 

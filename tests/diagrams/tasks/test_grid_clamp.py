@@ -84,8 +84,9 @@ def test_aligned_reward_rewards_approach_not_collision():
     assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
 
 
-def test_straight_descent_fails_with_offsets(env):
-    """The clamp presses on the table with at most 12 N until the time limit of 10 s."""
+def test_straight_descent_fails_with_offsets():
+    """The clamp presses on the table with at most 12 N until the time limit of 4 s."""
+    env = make_env("GridClamp", seconds=4.0)
     rows = evaluate_policy(env, straight_descent, episodes=1, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 0
     assert rows["peak_force"].max() < 1.2 * MAX_TRACKING_ERROR * STIFFNESS

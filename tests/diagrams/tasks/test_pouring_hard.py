@@ -41,7 +41,6 @@ def run(env, policy, **options):
     [
         (True, scripted_pour_aimed, "success"),
         (True, scripted_pour_blind, "time_limit"),
-        (False, scripted_pour_aimed, "success"),
         (False, scripted_pour_blind, "spill"),
     ],
 )

@@ -178,7 +178,7 @@ def test_connector_passes_with_uniform_actions():
     campaign = CAMPAIGNS["BncConnector"]()
     (case,) = (case for case in campaign.cases if case.name == "skgrl, per_episode, x, y")
     campaign = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
-    (row,) = run_campaign(campaign, at_least(1))
+    (row,) = run_campaign(campaign, at_least(1), environment={"time_step": 0.01})
     assert find_failures(outcome([row]), campaign.limits) == []
     # Depths and a force above zero show that the plug touched the jack.
     assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
@@ -186,7 +186,7 @@ def test_connector_passes_with_uniform_actions():
 
 
 def test_narrow_passage_passes_with_every_kind_of_action():
-    result = fuzz("NarrowPassage", episodes=8, seed=5)
+    result = fuzz("NarrowPassage", episodes=8, seed=5, environment={"control_period": 0.08})  # a quarter of the steps
     assert result["failures"] == []
     assert result["all"]["episodes"] == 8
     assert set(result["cases"]) == {case.name for case in CAMPAIGNS["NarrowPassage"]().cases}

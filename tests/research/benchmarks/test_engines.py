@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from guiderail.diagrams.tasks.contact_probe import SPEEDS, drag, press_on_rim
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import BncDimensions
-from guiderail_studies.contact_probe import probe_contact
+from guiderail_studies.contact_probe import DROPPED
 from research.benchmarks import engines
 from research.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever
 
@@ -31,9 +32,14 @@ def test_lever_is_similar_in_mujoco():
 
 def test_capture_and_drag_in_mujoco_are_those_of_the_geometry():
     pytest.importorskip("mujoco")
-    probe = probe_contact(engines.NARROW, "mujoco")
-    assert probe.capture == pytest.approx(engines.geometric_capture(), abs=0.03 * MM)
-    assert probe.drags == pytest.approx([engines.FRICTION] * 2, rel=0.05)
+    workcell, contact = engines.NARROW.workcell(), engines.NARROW.rim_contact()
+    drops, stays = (
+        press_on_rim(workcell, contact, [(engines.geometric_capture() + error, 0.0)], "mujoco", {})[0]
+        for error in (-0.03 * MM, 0.03 * MM)
+    )
+    assert drops["pose"][-1, 2] < contact.height - DROPPED < stays["pose"][-1, 2]
+    drags = [drag(workcell, contact, speed, "mujoco") for speed in SPEEDS]
+    assert drags == pytest.approx([engines.FRICTION] * 2, rel=0.05)
 
 
 def test_draw_writes_a_picture(tmp_path):

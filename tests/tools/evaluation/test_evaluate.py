@@ -178,7 +178,7 @@ def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
     def evaluate_in(processes):
         return evaluate(
             "uniform_random", "NarrowPassage", 2, baselines=["constant", "scripted"],
-            environment={"action_repeat": 40}, processes=processes, save=tmp_path / f"{processes}.npz",
+            environment={"control_period": 0.16}, processes=processes, save=tmp_path / f"{processes}.npz",
         )  # fmt: skip
 
     single, several = evaluate_in(1), evaluate_in(2)

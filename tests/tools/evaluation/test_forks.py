@@ -5,6 +5,7 @@ import time
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation import forks
 from guiderail.tools.evaluation.forks import check_processes, forked_map, num_cores
 
 
@@ -60,8 +61,10 @@ def test_forked_map_ends_its_processes_when_closed():
         os.kill(worker, 0)
 
 
-def test_check_processes_returns_the_number_of_cores():
-    assert check_processes(None) == num_cores() >= 1
+def test_check_processes_returns_the_number_of_cores(monkeypatch):
+    assert num_cores() >= 1
+    monkeypatch.setattr(forks, "num_cores", lambda: 7)
+    assert check_processes(None) == 7
     assert check_processes(3) == 3
     with pytest.raises(InputError, match="the number of processes must be a whole number of at least 1, not 0"):
         check_processes(0)

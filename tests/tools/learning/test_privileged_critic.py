@@ -140,7 +140,7 @@ def test_symmetry_of_the_connector_applies_to_hidden_values():
 
 
 def test_rollout_passes_hidden_values_to_callbacks_only():
-    env = make_env("GridClamp", fixture_offset="none", action_repeat=50)
+    env = make_env("GridClamp", fixture_offset="none", action_repeat=25, seconds=2.0)
     env.observes_privileged = True
     transitions = []
 

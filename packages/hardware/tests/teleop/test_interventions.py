@@ -199,6 +199,7 @@ def test_corrections_are_refused_without_demonstrations():
 def test_corrections_compensate_demonstrations_5_mm_off(tmp_path):
     """The reference leads 5 mm past the jack; after corrections in the first episode, the second succeeds."""
     environment = {"guidance": "kgrl", "fixture_offset": "none", "bound": 6e-3, "action_repeat": 10}
+    environment["time_step"] = 0.01  # twice the default
     environment["action_dims"] = (0, 1)
     corrections = ViaPointCorrections("BncConnector", environment)
     steps = np.arange(0, corrections._reference.num_steps, VIA_POINT_SPACING)
