@@ -40,18 +40,16 @@ NOMINAL = GridClampDimensions()
 
 
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 3.0}
-"""Options of difficulty="hard": a force limit of 10 N (snapping in needs 6 N), and a time limit that few random searches
-meet.
+"""Options of difficulty="hard": a short time limit, and a force limit of 10 N; snapping in needs 6 N.
 
 The impedance's force is bounded below the limit, so that an untrained policy fails by the time limit and not by a
-collision: with more time a random search succeeds, too. On the gantry with exact sensors, with the template, 14 of 100
-episodes of random actions succeed and 100 of 100 of `scripted_fast_search`. The time limit does not exclude a residual:
-random actions that are added to the straight descent still succeed in most episodes (research/experiments.md).
+collision. On the gantry with exact sensors, random inputs of the template succeed in 14 of 100 episodes and
+`scripted_fast_search` in 100. The time limit does not make residuals fail: random actions that are added to the
+straight descent succeed in most episodes (research/experiments.md).
 """
 
 HARD_6S: dict[str, Any] = HARD | {"seconds": 6.0}
-"""Options of difficulty="hard_6s", which was "hard" when most results were stored: random actions succeed in half of the
-episodes."""
+"""Options of difficulty="hard_6s", of which most results are stored: random actions succeed in half of the episodes."""
 
 STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
@@ -222,8 +220,9 @@ def scripted_search(observation: np.ndarray, search: LaneSearch = SEARCH) -> np.
     """Return the inputs (3,) in [−1, 1] of a memoryless search.
 
     The observation begins with the scaled position (3,) and force (3,). Above the table the clamp moves to the start of
-    the first lane. On the table it presses lightly and follows the lanes in alternating directions. In a hole it yields
-    to lateral forces, and pushes down until it snaps in, with at most `search.snap_force` [N].
+    the first lane. On the table it presses lightly and follows the lanes in alternating directions. In a hole, or if a
+    lateral force shows that pegs are caught in the chamfers, it yields to lateral forces, and pushes down with at most
+    `search.snap_force` [N] until it snaps in.
     """
     position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:6] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates command and position

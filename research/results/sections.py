@@ -193,7 +193,9 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("residual RL", "grid_clamp_hard_3s", "residual"),
                 Row("straight down", "grid_clamp_hard_3s", "straight"),
                 Row("random residual actions", "grid_clamp_hard_3s", "uniform_random_residual"),
-                *_baselines("grid_clamp_hard_3s", ("zero", *_NOT_CONSTANT[1:]), names=("zero action", *_NAMES_NOT_CONSTANT[1:])),
+                *_baselines(
+                    "grid_clamp_hard_3s", ("zero", *_NOT_CONSTANT[1:]), names=("zero action", *_NAMES_NOT_CONSTANT[1:])
+                ),
             ],
             guided=("RL-SCT, 3 demonstration episodes",),
         ),
