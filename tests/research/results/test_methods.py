@@ -236,7 +236,7 @@ def test_results_with_a_constant_offset_are_marked(hard_tasks):
     assert sentence.endswith(
         "held-out episodes: learned methods. A new one in every held-out episode: baseline policies."
     )
-    sensing, *_ = SECTIONS["GridClamp"]
+    _, sensing, *_ = SECTIONS["GridClamp"]
     assert offsets(sensing, TABLES) == ["One hidden offset for each seed, in training and in held-out episodes."]
     (named,) = offsets(Section("Two studies", [*sensing.rows[-1:], *clamp.rows[:4]]), TABLES)
     assert named.endswith(
