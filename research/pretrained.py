@@ -39,8 +39,9 @@ POLICIES: dict[str, dict[str, Any]] = {
         "disturbances.friction_factor": (0.5, 2.0), "settings": {"symmetry": "near", "privileged_critic": True},
     },
     "clamp": {
-        "task": "GridClamp", "guidance": "sct", "episodes": 60, "seed": 2300001, **ARM, "fixture_offset": "per_run",
-        "algorithm": "sac", "preset": "sac_gridclamp", "settings": {"demonstration_episodes": 3},
+        "task": "GridClamp", "guidance": "sct", "episodes": 60, "seed": 2300001, **ARM, "difficulty": "hard_6s",
+        "fixture_offset": "per_run", "algorithm": "sac", "preset": "sac_gridclamp",
+        "settings": {"demonstration_episodes": 3},
     },
     "pouring": {
         "task": "Pouring", "guidance": "sct", "episodes": 150, "seed": 113, "difficulty": "hard", "shield": False,

@@ -39,13 +39,17 @@ START_HEIGHT = (0.015, 0.018)
 NOMINAL = GridClampDimensions()
 
 
-HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
+HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 3.0}
 """Options of difficulty="hard": a short time limit, and a force limit of 10 N; snapping in needs 6 N.
 
 The impedance's force is bounded below the limit, so that an untrained policy fails by the time limit and not by a
-collision. On the gantry with exact sensors, random actions succeed in half of the episodes, and the scripted search in
-98 % (docs/results/grid_clamp.md).
+collision. On the gantry with exact sensors, random inputs of the template succeed in 14 of 100 episodes and
+`scripted_fast_search` in 100. The time limit does not make residuals fail: random actions that are added to the
+straight descent succeed in most episodes (research/experiments.md).
 """
+
+HARD_6S: dict[str, Any] = HARD | {"seconds": 6.0}
+"""Options of difficulty="hard_6s", of which most results are stored: random actions succeed in half of the episodes."""
 
 STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
@@ -176,56 +180,87 @@ SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 ON_TABLE = GridClampDimensions().peg_length  # height of the clamp while the pegs stand on the table [m]
 NEAR = 1.5 * MM  # height above the table below which the clamp descends slowly and searches [m]
 IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole [m]
-LANES = np.array([-1.1, 0.0, 1.1]) * MM  # y of the search lanes [m]; the pegs drop in from at least one lane
-LANE_ENDS = 3.7 * MM  # |x| of the ends of a lane [m], larger than the largest offset
-PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane [m]; a clamp beyond the last lane starts again
-PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
-SNAP_FORCE = 12.0  # largest force while the clamp snaps in [N]
-GENTLE_SNAP_FORCE = 8.5  # largest force while the clamp snaps in, for a force limit of 10 N [N]
-# Vertical speed per force error and lateral speed per force [m/s/N], and speed per distance from a lane [1/s].
-HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0
+PRESS = 4.0  # force of the search [N]
+YIELD_GAIN = 2.0 * MM  # lateral speed per force in a hole [m/s/N]
+
+
+@dataclass(frozen=True)
+class LaneSearch:
+    """Parameters of `scripted_search`."""
+
+    lanes: tuple[float, ...] = (-1.1 * MM, 0.0, 1.1 * MM)  # y of the lanes [m]; the pegs drop in from at least one lane
+    lane_ends: float = 3.7 * MM  # |x| of the ends of a lane [m], larger than the largest offset
+    past_lanes: float = 0.3 * MM  # overshoot along y from lane to lane [m]; a clamp beyond the last lane starts again
+    speed: float = 8.0 * MM  # speed along the lanes [m/s]
+    snap_force: float = 12.0  # largest force while the clamp snaps in [N]
+    lane_gain: float = 4.0  # speed per distance from a lane [1/s]
+    height_gain: float = 1.2 * MM  # vertical speed per force error [m/s/N]
+    caught_force: float = np.inf  # lateral force above which a peg is in a hole's chamfer [N]
+
+
+SEARCH = LaneSearch()
+GENTLE_SEARCH = LaneSearch(snap_force=8.5)
+FAST_SEARCH = LaneSearch(
+    lanes=(-1.5 * MM, 0.0, 1.5 * MM),
+    lane_ends=3.0 * MM,
+    past_lanes=0.6 * MM,
+    speed=20.0 * MM,
+    snap_force=8.5,
+    lane_gain=6.0,
+    height_gain=3.0 * MM,
+    caught_force=2.0,
+)
 TEMPLATE = load_template("grid_clamp")  # template of the thesis, section 3.4.2
 SPEED = TEMPLATE.parameters["speed_m_per_s"]  # speed at an input of 1 [m/s]
 LIFT = TEMPLATE.parameters["lift"]  # fraction of `SPEED` at an upward input of 1
 STIFFNESS = Impedance().stiffness[0]  # translational stiffness [N/m]
 
 
-def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
+def scripted_search(observation: np.ndarray, search: LaneSearch = SEARCH) -> np.ndarray:
     """Return the inputs (3,) in [−1, 1] of a memoryless search.
 
     The observation begins with the scaled position (3,) and force (3,). Above the table the clamp moves to the start of
-    the first lane. On the table it presses lightly and follows the lanes in alternating directions. In a hole it yields
-    to lateral forces, and pushes down until it snaps in, with at most `snap_force` [N].
+    the first lane. On the table it presses lightly and follows the lanes in alternating directions. In a hole, or if a
+    lateral force shows that pegs are caught in the chamfers, it yields to lateral forces, and pushes down with at most
+    `search.snap_force` [N] until it snaps in.
     """
     position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:6] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates command and position
+    is_on_table = position[2] > ON_TABLE - IN_HOLE and np.hypot(*force[:2]) < search.caught_force
+    start = np.array([-search.lane_ends, search.lanes[0]])
     if position[2] > ON_TABLE + NEAR:
-        velocity = np.array([*(LANE_GAIN * (np.array([-LANE_ENDS, LANES[0]]) - position[:2])), -SPEED])
-        if position[2] < ON_TABLE + 3 * NEAR and np.hypot(position[0] + LANE_ENDS, position[1] - LANES[0]) > 0.5 * MM:
+        velocity = np.array([*(search.lane_gain * (start - position[:2])), -SPEED])
+        if position[2] < ON_TABLE + 3 * NEAR and np.hypot(*(position[:2] - start)) > 0.5 * MM:
             velocity[2] = 0.0  # no descent before the clamp is at the start of the first lane
-    elif position[2] > ON_TABLE - IN_HOLE and command[1] > LANES[-1] + 0.5 * PAST_LANES:
+    elif is_on_table and command[1] > search.lanes[-1] + 0.5 * search.past_lanes:
         velocity = np.array([0.0, 0.0, SPEED])  # lift, and begin at the first lane again
-    elif position[2] > ON_TABLE - IN_HOLE:
-        velocity = np.array([*_lane_velocity(command[:2]), HEIGHT_GAIN * (force[2] - PRESS)])
+    elif is_on_table:
+        velocity = np.array([*_lane_velocity(command[:2], search), search.height_gain * (force[2] - PRESS)])
     else:
-        velocity = np.array([*(YIELD_GAIN * force[:2]), HEIGHT_GAIN * (force[2] - snap_force)])
+        velocity = np.array([*(YIELD_GAIN * force[:2]), search.height_gain * (force[2] - search.snap_force)])
     speeds = np.array([SPEED, SPEED, LIFT * SPEED if velocity[2] > 0.0 else SPEED])
     return np.clip(velocity / speeds, -1.0, 1.0)
 
 
-def _lane_velocity(xy: np.ndarray) -> np.ndarray:
+def _lane_velocity(xy: np.ndarray, search: LaneSearch) -> np.ndarray:
     """Return the velocity (2,) [m/s] along the lanes at the position `xy` (2,) [m]."""
-    lane = int(np.argmin(np.abs(LANES - xy[1])))
+    lanes = np.array(search.lanes)
+    lane = int(np.argmin(np.abs(lanes - xy[1])))
     forward = 1.0 if lane % 2 == 0 else -1.0
-    if forward * xy[0] < LANE_ENDS - 0.1 * MM:
-        return np.array([forward * SEARCH_SPEED, LANE_GAIN * (LANES[lane] - xy[1])])
+    if forward * xy[0] < search.lane_ends - 0.1 * MM:
+        return np.array([forward * search.speed, search.lane_gain * (lanes[lane] - xy[1])])
     # The speed falls towards the next lane. Otherwise the clamp would overshoot it, because the force is delayed.
-    return np.array([0.0, LANE_GAIN * (LANES[min(lane + 1, len(LANES) - 1)] + PAST_LANES - xy[1])])
+    return np.array([0.0, search.lane_gain * (lanes[min(lane + 1, len(lanes) - 1)] + search.past_lanes - xy[1])])
 
 
 def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
     """Return the inputs (3,) of `scripted_search` for a force limit of 10 N."""
-    return scripted_search(observation, GENTLE_SNAP_FORCE)
+    return scripted_search(observation, GENTLE_SEARCH)
+
+
+def scripted_fast_search(observation: np.ndarray) -> np.ndarray:
+    """Return the inputs (3,) of `scripted_search` for a force limit of 10 N and a short time limit."""
+    return scripted_search(observation, FAST_SEARCH)
 
 
 def straight_descent(observation: np.ndarray) -> np.ndarray:
@@ -247,9 +282,9 @@ class GridClamp(InsertionTask):
     workpiece, fixture = "clamp", "table"
     simulated_rewards = ("aligned",)
     snaps_in = True
-    presets = {"hard": HARD}
-    scripted_policies = (scripted_search, scripted_gentle_search, straight_descent)
-    scripted_defaults = {"hard": scripted_gentle_search}
+    presets = {"hard": HARD, "hard_6s": HARD_6S}
+    scripted_policies = (scripted_search, scripted_gentle_search, scripted_fast_search, straight_descent)
+    scripted_defaults = {"hard": scripted_fast_search, "hard_6s": scripted_gentle_search}
     defaults = {"guidance": "sct", "action_repeat": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 

@@ -32,7 +32,11 @@ HARD_TASKS_COLUMNS = (
 )  # fmt: skip
 # Columns and rows of the README's table of hard tasks: without an effect, and with an effect of template and primitive.
 README_COLUMNS = 5
-README_TITLES = ("Connector, hard, converged contact", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
+README_TITLES = (
+    "Connector, hard, converged contact",
+    "Grid clamp, hard, 6 s, force not bounded",
+    "Narrow passage, hard",
+)
 MISSING = "–"
 ALWAYS = (0, 2)  # columns that every table of methods has: name and success
 BRIEF = (0, 1, 2, 5, 6)  # columns of a brief table of methods

@@ -186,7 +186,21 @@ SECTIONS: dict[str, list[Section]] = {
     ],
     "GridClamp": [
         Section(
-            "Grid clamp, hard, on an iiwa with a robot's sensors",
+            "Grid clamp, hard",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "grid_clamp_hard_3s", "sct"),
+                Row("RL-SCT", "grid_clamp_hard_3s", "sct_alone"),
+                Row("residual RL", "grid_clamp_hard_3s", "residual"),
+                Row("straight down", "grid_clamp_hard_3s", "straight"),
+                Row("random residual actions", "grid_clamp_hard_3s", "uniform_random_residual"),
+                *_baselines(
+                    "grid_clamp_hard_3s", ("zero", *_NOT_CONSTANT[1:]), names=("zero action", *_NAMES_NOT_CONSTANT[1:])
+                ),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
+        Section(
+            "Grid clamp, hard, 6 s, on an iiwa with a robot's sensors",
             [
                 Row("RL-SCT, 3 demonstration episodes", "grid_clamp_robot_sensing", "sct"),
                 Row("RL-SCT", "grid_clamp_robot_sensing", "sct_not_shown"),
@@ -198,7 +212,7 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("RL-SCT, 3 demonstration episodes",),
         ),
         Section(
-            "Grid clamp, hard",
+            "Grid clamp, hard, 6 s",
             [
                 Row("RL-SCT, 3 demonstration episodes", "peers_grid_clamp_hard", "sct"),
                 Row("RL-SCT", "peers_grid_clamp_hard", "sct_alone"),
@@ -217,7 +231,7 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("RL-SCT",),
         ),
         Section(
-            "Grid clamp, hard, force not bounded",
+            "Grid clamp, hard, 6 s, force not bounded",
             [
                 Row("RL-SCT, 3 demonstration episodes", "peers_grid_clamp_hard_unbounded", "sct"),
                 Row("RL-SCT", "peers_grid_clamp_hard_unbounded", "sct_alone"),

@@ -16,8 +16,9 @@ HARD = (
     "narrow_passage_hard_baselines",
     "connector_robot_sensing",
     "connector_robot_sensing_transfer",
-    "grid_clamp_robot_sensing",
+    "grid_clamp_hard_3s",
 )
+HARD_6S = ("grid_clamp_hard", "peers_grid_clamp_hard", "grid_clamp_robot_sensing", "grid_clamp_sweep")
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
 # The study whose policies each sweep evaluates.
 TRAINED_BY = {
@@ -28,12 +29,13 @@ TRAINED_BY = {
 }
 
 
-@pytest.mark.parametrize("name", [*HARD, *SWEEPS])
+@pytest.mark.parametrize("name", dict.fromkeys([*HARD, *HARD_6S, *SWEEPS]))
 def test_all_methods_of_a_study_can_be_configured(name, tmp_path):
     study = load_study(study_path(name))
     for method in study.methods:
         job = Job(study, method, study.seeds[0], tmp_path)
-        assert job.config(job.after_episodes[-1]).environment["difficulty"] == "hard"
+        difficulty = "hard_6s" if name in HARD_6S else "hard"
+        assert job.config(job.after_episodes[-1]).environment["difficulty"] == difficulty
 
 
 @pytest.mark.parametrize("name", TRAINED_BY)

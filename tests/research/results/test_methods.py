@@ -188,7 +188,7 @@ def test_brief_table_has_success_stops_and_violations(tmp_path):
 
 
 def test_knowledge_lists_demonstrated_episodes_when_unequal():
-    (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard")
+    (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard, 6 s")
     (sentence,) = knowledge(hard, TABLES)
     assert "; 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other methods." in sentence
     assert "10 demonstrated episodes: RL-SCT by behavior cloning, RL-SCT by RLPD, RL-SCT by DroQ; 3" in sentence
@@ -228,15 +228,15 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
 
 def test_results_with_a_constant_offset_are_marked(hard_tasks):
     table = {row[0]: row for row in rows(hard_tasks)}
-    assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
-    assert table["Grid clamp, hard"][6] == "60 (10)"
+    assert table["Grid clamp, hard, 6 s"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
+    assert table["Grid clamp, hard, 6 s"][6] == "60 (10)"
     assert "†" not in "".join(table["Connector, hard, contact at 10 ms"])
     (clamp,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp")
     (sentence,) = offsets(clamp, TABLES)
     assert sentence.endswith(
         "held-out episodes: learned methods. A new one in every held-out episode: baseline policies."
     )
-    sensing, *_ = SECTIONS["GridClamp"]
+    _, sensing, *_ = SECTIONS["GridClamp"]
     assert offsets(sensing, TABLES) == ["One hidden offset for each seed, in training and in held-out episodes."]
     (named,) = offsets(Section("Two studies", [*sensing.rows[-1:], *clamp.rows[:4]]), TABLES)
     assert named.endswith(

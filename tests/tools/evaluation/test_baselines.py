@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import GAIN, NUM_STEPS, PRESSING, SCALED_RIM, TIME, TORQUE_X, TORQUE_Y, Z
-from guiderail.diagrams.tasks.grid_clamp import scripted_gentle_search, scripted_search, straight_descent
+from guiderail.diagrams.tasks.grid_clamp import (
+    scripted_fast_search,
+    scripted_gentle_search,
+    scripted_search,
+    straight_descent,
+)
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
@@ -39,7 +44,8 @@ def test_policy_of_a_gantry_run_succeeds_on_the_arm(tmp_path):
 
 def test_scripted_policy_is_found_by_name_or_as_the_default():
     assert find_scripted_policy("GridClamp", "scripted") is scripted_search
-    assert find_scripted_policy("GridClamp", "scripted", "hard") is scripted_gentle_search
+    assert find_scripted_policy("GridClamp", "scripted", "hard") is scripted_fast_search
+    assert find_scripted_policy("GridClamp", "scripted", "hard_6s") is scripted_gentle_search
     assert find_scripted_policy("GridClamp", "straight_descent") is straight_descent
     with pytest.raises(InputError, match="did you mean scripted_torque_search"):
         find_scripted_policy("BncConnector", "scripted_torqe_search")
