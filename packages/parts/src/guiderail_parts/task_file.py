@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -396,7 +396,7 @@ class PartTaskFile(Options):
         """Measured clearance between the parts [m]; 0 if it was not measured."""
         return MM * float(self.measured.get("clearance_mm") or 0.0)
 
-    @cached_property
+    @property
     def turn(self) -> float:
         """Turn of the plug about z at the bottom [rad]."""
         return self.motion.turn * DEGREE

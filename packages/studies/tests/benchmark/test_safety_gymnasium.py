@@ -76,7 +76,7 @@ def test_omnisafe_environment_has_the_interface_of_a_cmdp(registered):
     assert len(tensors) == 5
     assert all(isinstance(value, torch.Tensor) for value in tensors)
     assert np.isclose(float(tensors[2]), info["cost"])
-    assert env.max_episode_steps == 60
+    assert env.max_episode_steps == 30
     assert (env.num_envs, env.time_limit) == (1, None)
     env.close()
 
