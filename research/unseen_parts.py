@@ -5,9 +5,9 @@ Then the parts are prepared, a policy is trained over the training parts with ea
 on the held-out parts: uniform random actions, the scripted search (with the contact map, and by the center of pressure
 alone), policies of single training parts, specialists of the held-out parts, the general policy of each seed, and the
 mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, and in
-MuJoCo. `--few-shot` compares specialists that learn from scratch with those that the general policy demonstrates to.
-Every finished step is stored, and the same command resumes. `rows/` has the episodes of each policy on each part,
-`table.md` the successes.
+MuJoCo. `--few-shot` compares specialists that learn from scratch with those that the general policy demonstrates to,
+and evaluates the former on the other parts. Every finished step is stored, and the same command resumes. `rows/` has
+the episodes of each policy on each part, `table.md` the successes.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ DEMONSTRATED = {"demonstration_episodes": 5, "demonstration_fraction": 0.5, "exp
 SETTINGS = {"symmetry": "near", "exploration.constant_episodes": 12}
 SEARCH = {"time": 0, "height": 15, "above": -0.1, "after": 0.33, "amplitude": 1.5, "cycles": [4.4, 3.0]}
 """`RimSearch` of the mean of the seeds, in entries of the observation "shared": from 0.5 mm below the first contact."""
-CALIBRATED = 10  # episodes that calibrate `difficulty=hard` of each held-out part
+CALIBRATED = 10  # episodes that calibrate `difficulty=hard` of each held-out part, or compare policies of single parts
 EASY_RANDOM, EASY_SEARCH = 0.2, 0.9  # success rates above which a part cannot show learning
 
 
@@ -125,6 +125,23 @@ def learn_few_shot(part: Path, general: Path, seed: int, evaluated: int, out: Pa
                 evaluate_part(part, {f"{name}-{episodes}": run}, evaluated, out)
             if read_table(file)["success"].mean() >= ENOUGH:
                 break
+
+
+def compare_single_parts(few: Sequence[Path], others: Sequence[Path], evaluated: int, out: Path) -> None:
+    """Evaluate each policy of `learn_few_shot` from scratch on all parts `few`, and the best of them on the others.
+
+    The best one has the highest mean on the parts that it did not learn.
+    """
+    runs = {f"single-part-{part.name}": out / "runs" / f"scratch-{part.name}" for part in few}
+    rates: dict[str, list[float]] = {name: [] for name in runs}
+    for part in few:
+        evaluate_part(part, runs, CALIBRATED, out)
+        for name in runs:
+            if not name.endswith(part.name):
+                rates[name].append(read_table(out / "rows/hard" / name / f"{part.name}.csv")["success"].mean())
+    best = max((name for name in runs if rates[name]), key=lambda name: sum(rates[name]), default=None)
+    for part in others if best is not None else ():
+        evaluate_part(part, {str(best): runs[str(best)]}, evaluated, out)
 
 
 def tabulate(rows: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -226,6 +243,7 @@ def main(arguments: list[str]) -> None:
         evaluate_part(part, {"specialist": run}, args.evaluated, out)
     for part in held_out[: args.few_shot]:
         learn_few_shot(part, out / "runs" / "general-mean", 0, args.evaluated, out)
+    compare_single_parts(held_out[: args.few_shot], held_out[args.few_shot :], args.evaluated, out)
     summary = {}
     for condition in CONDITIONS:
         if (out / "rows" / condition).is_dir():

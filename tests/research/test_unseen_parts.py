@@ -1,12 +1,14 @@
 """Study of held-out parts: rule of the split, and table of stored episodes."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
 pytest.importorskip("guiderail_parts")
 
 from guiderail.models.common.errors import InputError
-from research.unseen_parts import main, prepared, split_parts, tabulate
+from research.unseen_parts import compare_single_parts, main, prepared, split_parts, tabulate
 
 
 def test_split_depends_on_the_names_alone():
@@ -39,6 +41,28 @@ def test_easy_parts_are_reported_apart(tmp_path):
     assert summary["general-0"]["mean"] == 0.75
     assert summary["general-0"]["mean_where_learning_shows"] == 1.0
     assert (summary["general-0"]["collisions"], summary["general-0"]["peak_force"]) == (2, 4.0)
+
+
+def test_best_single_part_policy_is_chosen_without_its_own_part(tmp_path, monkeypatch):
+    """The policy of part a solves only its own part, that of b only a."""
+    successes = {"single-part-a": {"a": 1, "b": 0}, "single-part-b": {"a": 1, "b": 0}}
+    evaluated = []
+
+    def evaluate(part, policies, episodes, out):
+        for name in policies:
+            evaluated.append((part.name, name, episodes))
+            folder = out / "rows/hard" / name
+            folder.mkdir(parents=True, exist_ok=True)
+            pd.DataFrame({"success": [successes[name].get(part.name, 0)]}).to_csv(
+                folder / f"{part.name}.csv", index=False
+            )
+
+    monkeypatch.setattr("research.unseen_parts.evaluate_part", evaluate)
+    compare_single_parts([Path("a"), Path("b")], [Path("c"), Path("d")], 20, tmp_path)
+    assert evaluated[4:] == [("c", "single-part-b", 20), ("d", "single-part-b", 20)]
+    evaluated.clear()
+    compare_single_parts([], [Path("c")], 20, tmp_path)
+    assert evaluated == []
 
 
 def test_split_of_other_meshes_is_refused(tmp_path):
