@@ -41,6 +41,8 @@ class Setting:
         algorithms: Names of the learners.
         remarks: Pairs of a text and a predicate of the environment's options. If the predicate is true for a run, the
             text is a difference of the run. It is a format string of the environment's options.
+        control_period: Time of the control steps that `action_repeat` counts [s], if the thesis states the rate of
+            actions; None: those of the run.
     """
 
     section: str
@@ -48,6 +50,13 @@ class Setting:
     preset: str
     algorithms: tuple[str, ...]
     remarks: tuple[tuple[str, Callable[[Mapping[str, Any]], bool]], ...] = ()
+    control_period: float | None = None
+
+    def action_repeat(self, config: RunConfig) -> float:
+        """Return the number of control steps of an action of a run."""
+        period = config.environment.get("control_period")
+        scale = 1.0 if period is None or self.control_period is None else period / self.control_period
+        return round(config.action_repeat * scale, 9)
 
 
 def _always(environment: Mapping[str, Any]) -> bool:
@@ -142,6 +151,7 @@ THESIS = {
             ("a template that is slower upwards than downwards (thesis: no speeds given)",
              _where("guidance", "sct")),
         ),
+        control_period=0.02,
     ),
     "Pouring": Setting(
         "3.4.1",
@@ -168,6 +178,7 @@ THESIS = {
             ("own template after table 3.3, for these vessels (thesis: the template of an earlier work)",
              _where("guidance", "sct")),
         ),
+        control_period=0.01,
     ),
 }  # fmt: skip
 
@@ -226,8 +237,9 @@ def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]
     for name, values in setting.options.items():
         if name not in environment or not _is_given(name, environment):
             continue
-        if not any(_is_same(environment[name], value) for value in values):
-            differences.append(f"{_words(name)} {_format(environment[name])} (thesis: {_format_any(values)})")
+        ours = setting.action_repeat(config) if name == "action_repeat" else environment[name]
+        if not any(_is_same(ours, value) for value in values):
+            differences.append(f"{_words(name)} {_format(ours)} (thesis: {_format_any(values)})")
     if learns:
         symmetry = config.learner.symmetry if _has_symmetry(config) else False
         differences += _learner_differences(
@@ -289,7 +301,7 @@ def _learner_differences(config: RunConfig, setting: Setting) -> list[str]:
     (action_repeat_of_thesis,) = setting.options["action_repeat"]
     gammas = [
         action_gamma(settings, action_repeat) ** (1 / action_repeat)
-        for settings, action_repeat in ((learner, config.action_repeat), (table, action_repeat_of_thesis))
+        for settings, action_repeat in ((learner, setting.action_repeat(config)), (table, action_repeat_of_thesis))
     ]
     if not math.isclose(*gammas, rel_tol=1e-9):
         differences.append(f"gamma of a control step {gammas[0]:.4g} (thesis: {gammas[1]:.4g})")

@@ -221,6 +221,13 @@ def test_gamma_is_compared_per_control_step():
     assert not any("gamma" in remark for remark in remarks)
 
 
+def test_actions_are_compared_per_second_where_the_thesis_states_their_rate():
+    longer = differences_of("Pouring", {"control_period": 0.1, "action_repeat": 1}, preset="table_3_2_iiwa")
+    assert not any(remark.startswith(("control steps", "gamma")) for remark in longer)
+    rarer = differences_of("Pouring", {"control_period": 0.1, "action_repeat": 2}, preset="table_3_2_iiwa")
+    assert "control steps of an action 20 (thesis: 10)" in rarer
+
+
 def test_pouring_remarks_depend_on_reward():
     assert any("weights in equation 3.7" in remark for remark in differences_of("Pouring"))
     sparse = differences_of("Pouring", {"reward": "sparse"})
