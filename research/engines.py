@@ -33,6 +33,8 @@ CONDITIONS: dict[str, tuple[dict[str, Any], int]] = {
     "Drake 2.5 ms": ({"time_step": 0.0025}, 40),
     "Drake 1.25 ms": ({"time_step": 0.00125}, 40),
     "MuJoCo": ({"station": "mujoco"}, 100),
+    "Bullet": ({"station": "pybullet"}, 40),
+    "PhysX": ({"station": "sapien"}, 40),
     "gantry": ({"station": "gantry"}, 40),
     "Panda": ({"robot": "panda"}, 40),
     "UR5e": ({"robot": "ur5e"}, 40),
