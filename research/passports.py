@@ -2,8 +2,8 @@
 
     python -m research.passports RUN [RUN ...] --out passports
 
-Each policy is evaluated in the same held-out episodes in each installed engine at its default step, and in Drake and
-MuJoCo with other friction and clearance. Finished conditions are stored, and the same command resumes. The success in
+Each policy is evaluated in the same held-out episodes in each installed engine at its default step, and in Drake with
+other friction and clearance. Finished conditions are stored, and the same command resumes. The success in
 an engine is predicted from the conditions of the others, as `guiderail passport` does. `passports.csv` has one row per
 policy and condition, `predictions.csv` one per policy and engine.
 """
@@ -21,7 +21,7 @@ from guiderail_studies.passport import installed_engines, passport_conditions, p
 from research.command import Parser, print_result, run_program
 from research.stored import report
 
-CHANGED = ("drake", "mujoco")  # engines in which friction and clearance are changed
+CHANGED = "drake"  # engine in which friction and clearance are changed
 WITHIN = 0.05  # largest error of a good prediction
 
 
@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> None:
             config.task, subject.changed_environment({}), installed_engines(), lambda sentence: None
         )
         defaults = {engine: next(c for c in possible if c.engine == engine) for engine in ENGINES}
-        found = [c for c in possible if c is defaults[c.engine] or (c.change and c.engine in CHANGED)]
+        found = [c for c in possible if c is defaults[c.engine] or (c.change and c.engine == CHANGED)]
         evaluated = evaluate_conditions(
             subject, found, out, episodes=args.episodes, seed=HELD_OUT_SEED, processes=args.processes
         )
