@@ -14,6 +14,7 @@ from pathlib import Path
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically as write_atomically
+from guiderail.models.common.files import write_error as write_error
 
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 PAGES = (".html", ".htm")
@@ -112,11 +113,6 @@ def atomic_folder(out: Path) -> Iterator[Path]:
         raise write_error(out, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def write_error(path: Path, error: OSError) -> InputError:
-    """Return the error for a path that cannot be written."""
-    return InputError(f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write")
 
 
 def path_exists(path: Path) -> bool:

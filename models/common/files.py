@@ -33,7 +33,12 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         with suppress(OSError):  # the parent may be a file
             temporary.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written ({error.strerror}): choose a folder with room to write") from error
+        raise write_error(path, error) from error
+
+
+def write_error(path: Path, error: OSError) -> InputError:
+    """Return the error for a path that cannot be written."""
+    return InputError(f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write")
 
 
 def digest(arrays: Mapping[str, np.ndarray], text: str) -> str:

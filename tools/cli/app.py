@@ -4,7 +4,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from importlib import import_module
 from inspect import Parameter, Signature, signature
@@ -175,13 +175,18 @@ def _refuse_repetition(parameter: Any, words: Sequence[str]) -> None:
         if on.intersection(words) and off.intersection(words):
             raise InputError(f"{parameter.opts[0]} and {parameter.secondary_opts[0]} contradict each other: give one")
         return
-    values = [
-        word.partition("=")[2] if "=" in word else following
-        for word, following in pairwise([*words, ""])
-        if word.partition("=")[0] in on
-    ]
+    values = option_values(words, on)
     for value in values[1:]:
         check_same(parameter.opts[0], values[0], value)
+
+
+def option_values(words: Sequence[str], names: Collection[str]) -> list[str]:
+    """Return the values of an option in their order, given as `--option value` or `--option=value` by its `names`."""
+    return [
+        word.partition("=")[2] if "=" in word else following
+        for word, following in pairwise([*words, ""])
+        if word.partition("=")[0] in names
+    ]
 
 
 def expand_choices(text: str) -> str:
@@ -486,17 +491,12 @@ def find_task(name_or_folder: str, imports: Sequence[str] | None = None) -> tupl
     return task_named(name_or_folder)
 
 
-def is_hardware(station: Any) -> bool:
-    """Return True if `station` is the name of a hardware station."""
-    if station is None:
-        return False
-    stations = import_module("guiderail.diagrams.stations.registry").STATIONS
-    return station in stations.names() and not stations.get(station).is_simulated
-
-
 def refuse_robot(station: Any, remedy: str) -> None:
     """Raise an InputError that names the remedy if `station` is a real robot."""
-    if is_hardware(station):
+    if station is None:
+        return
+    stations = import_module("guiderail.diagrams.stations.registry").STATIONS
+    if station in stations.names() and not stations.get(station).is_simulated:
         raise InputError(f"station={station} is a real robot, which a reset cannot move: use {remedy}")
 
 

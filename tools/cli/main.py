@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ import typer
 
 from guiderail.models.common.errors import InputError, RunsFailedError, brief, explain_missing
 from guiderail.models.common.registry import SIBLINGS, MissingSiblingError, did_you_mean, find_plugins
-from guiderail.tools.cli.app import app, print_message
+from guiderail.tools.cli.app import app, option_values, print_message
 from guiderail.tools.terminal import protect_terminal
 
 COMMANDS = ("train", "demo", "evaluate", "visualize", "list")
@@ -130,19 +129,10 @@ def _resume_hint(arguments: list[str]) -> str:
     name, *words = map(str, [*arguments, ""])
     if name == "study":
         return "; the same command resumes it"
-    folders = _values(words, "--out")
+    folders = option_values(words, ["--out"])
     if name == "train" and folders and (Path(folders[-1]) / "checkpoint").is_dir():
         return "; resume with --resume"
     return ""
-
-
-def _values(words: list[str], option: str) -> list[str]:
-    """Return the values of an option, given as `--option value` or `--option=value`, in their order."""
-    return [
-        word.partition("=")[2] or following
-        for word, following in pairwise([*words, ""])
-        if word.partition("=")[0] == option
-    ]
 
 
 def _usage_sentence(error: Any, arguments: list[str]) -> str:
@@ -154,7 +144,7 @@ def _usage_sentence(error: Any, arguments: list[str]) -> str:
     if hasattr(error, "possibilities"):
         known = [name for parameter in context.command.params for name in parameter.opts] if context else []
         if "--env" in known and error.option_name in ENVIRONMENT_OPTIONS:
-            value = (_values(arguments, error.option_name) or [""])[-1] or "VALUE"
+            value = (option_values(arguments, [error.option_name]) or [""])[-1] or "VALUE"
             name = error.option_name.removeprefix("--").replace("-", "_")
             return f"there is no option {error.option_name} here: give --env {name}={value}"
         return f"there is no option {error.option_name}: {did_you_mean(error.option_name, known)}"
