@@ -393,7 +393,6 @@ def build_task_diagram(
         observation_space=loop.space,
         reward_terms=reward.term_names,
         randomize=make_randomize(config, station, guidance, diagram),
-        push=_push(station) if station.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
         contact_results=contact_results_of(station),
         symmetry=symmetry,
@@ -531,16 +530,6 @@ def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagr
         return {**sampled, **station.disturb(context, rng)}
 
     return randomize
-
-
-def _push(station: Station) -> Any:
-    """Return the function `TaskDiagram.push`."""
-
-    def push(context: Context, displacement: np.ndarray) -> None:
-        pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
-        station.set_pose(context, pose + displacement)
-
-    return push
 
 
 # Smallest distance of demonstrated angles from ±180° [rad], because actions and contact turn the tool further.

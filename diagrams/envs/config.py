@@ -30,7 +30,7 @@ from guiderail.diagrams.guidance.registry import (
     possible_guidance,
 )
 from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, StationKind, kind_of, stations_for
+from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, whole_multiple
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Task
@@ -167,8 +167,16 @@ def stations_of(task: type[Task]) -> list[str]:
 
 
 def station_kind_of(task: type[Task]) -> StationKind:
-    """Return the registered kind of a task's default station."""
-    return kind_of(getattr(task, "station", None), task.name)
+    """Return the registered kind of a task's default station.
+
+    Raises:
+        InputError: If the station is not registered.
+    """
+    station = getattr(task, "station", None)
+    kind = getattr(station, "kind", None)
+    if not isinstance(kind, StationKind):
+        raise InputError(f"station of {task.name} is a class that register_station registers, not {brief(station)}")
+    return kind
 
 
 def prior_of(task: type[Task]) -> Prior:

@@ -416,19 +416,6 @@ class DiagramEnv(DrakeGymEnv):
             self.diagram.view.publish(self.simulator.get_context())
         return None
 
-    def push(self, displacement: np.ndarray) -> None:
-        """Displace the robot, as a push by an operator between two control steps would.
-
-        Args:
-            displacement: Displacement of the pose, (O,).
-
-        Raises:
-            InputError: If the task's robot cannot be pushed, or the displaced pose is not O finite numbers.
-        """
-        if self.diagram.push is None:
-            raise InputError("this task has no robot that can be pushed")
-        self.diagram.push(self.simulator.get_mutable_context(), displacement)
-
     def _check_action(self, action: Any) -> np.ndarray:
         try:
             if np.iscomplexobj(action):

@@ -131,8 +131,6 @@ class TaskDiagram:
         randomize: Function that samples the episode's conditions, writes them into the root context and returns them
             for `info`. Its arguments are the root context (just restored to the default), the environment's random
             generator and the options of the reset. It raises an `InputError` for an unknown option.
-        push: Function that displaces the measured pose; its arguments are the root context and the displacement (O,).
-            None if the robot cannot be pushed.
         query: Query port of the scene, for a browser view.
         contact_results: Port of the plant's contact results, for a browser view.
         view: Browser view of an environment made with `render_mode="human"`.
@@ -151,7 +149,6 @@ class TaskDiagram:
     observation_space: gymnasium.spaces.Box
     reward_terms: tuple[str, ...]
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = lambda *_: {}
-    push: Callable[[Context, np.ndarray], None] | None = None
     query: OutputPort | None = None
     contact_results: OutputPort | None = None
     view: View | None = None

@@ -150,7 +150,6 @@ class PouringStation(Station):
     """
 
     wraps_angles = True
-    pushable = False  # the balls in the thermos would not move with the robot
 
     def __init__(self, config: PouringConfig, control_period: float | None = None):
         """Construct the station; a `control_period` [s] replaces that of the `config`.

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_kind
 
 if TYPE_CHECKING:
@@ -52,18 +51,6 @@ def register_station(
         return build
 
     return add
-
-
-def kind_of(station: Any, task: str) -> StationKind:
-    """Return the registered kind of a class or function; error messages name the `task` whose station it is.
-
-    Raises:
-        InputError: If it is not registered.
-    """
-    kind = getattr(station, "kind", None)
-    if not isinstance(kind, StationKind):
-        raise InputError(f"station of {task} is a class that register_station registers, not {brief(station)}")
-    return kind
 
 
 def stations_for(workcell_kind: str) -> list[str]:

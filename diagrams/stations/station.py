@@ -176,7 +176,6 @@ class Station(Diagram):
         plant: The simulated plant.
         scene_graph: Its scene graph.
         control_period: Time between commands [s].
-        pushable: True if `DiagramEnv.push` may displace the robot.
         wraps_angles: True if the pose's angles jump at ±π; the angles of a gantry are unbounded.
     """
 
@@ -184,7 +183,6 @@ class Station(Diagram):
     scene_graph: SceneGraph
     control_period: float = CONTROL_PERIOD
     wraps_angles: bool = False
-    pushable: bool = True
 
     @property
     def time_step(self) -> float:

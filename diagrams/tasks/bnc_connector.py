@@ -71,30 +71,20 @@ class BncUncertainty(HiddenOffsets):
     - "per_episode": the jack is within 1.5 mm of its nominal position, sampled each episode.
     - "none": the jack is within 0.3 mm of its nominal position, sampled each episode.
 
-    With `jack_turn`, which only the tasks of packages/parts set, the jack is also rotated about its axis; the jack's
-    offset is then [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and
-    the plug not offset.
+    The reset option `offset` sets the jack's position; the plug is then not offset.
     """
 
-    def __init__(
-        self,
-        kind: str,
-        *,
-        offset_range: Sequence[float] | None = None,
-        jack_turn: float = 0.0,
-    ):
+    def __init__(self, kind: str, *, offset_range: Sequence[float] | None = None):
         """Construct the sampler.
 
-        `jack_turn` is the largest turn of the jack [degrees]. `offset_range` is the smallest and largest offset of the
-        jack [m]; default: that of the kind.
+        `offset_range` is the smallest and largest offset of the jack [m]; default: that of the kind.
         """
         super().__init__(kind)
-        self.jack_turn = jack_turn * DEGREE
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
 
     def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
         # Every kind samples this offset, so that all kinds take the same random numbers.
-        return self._append_turn(in_ring(rng, *self.offset_range), rng)
+        return in_ring(rng, *self.offset_range)
 
     def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.kind == "per_run":
@@ -102,14 +92,10 @@ class BncUncertainty(HiddenOffsets):
         else:
             jack, plug = in_ring(rng, *self.offset_range), np.zeros(2)
         rng.uniform(size=2)  # stored results of a seed depend on the number of samples
-        return (jack if self.kind == "per_run" else self._append_turn(jack, rng)), plug
+        return jack, plug
 
     def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        jack = np.append(offset, 0.0) if self.jack_turn > 0.0 else offset
-        return jack, np.zeros(2)
-
-    def _append_turn(self, jack: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return np.append(jack, rng.uniform(-self.jack_turn, self.jack_turn)) if self.jack_turn > 0.0 else jack
+        return offset, np.zeros(2)
 
 
 ALIGNMENT = 2.0 * MM  # largest |x| and |y| of every command: equation 4.26

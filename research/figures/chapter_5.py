@@ -169,11 +169,19 @@ def _run(env: Any, push: tuple[int, np.ndarray] | None) -> tuple[np.ndarray, np.
 
     def act(observation: np.ndarray) -> np.ndarray:
         if push is not None and len(env.unwrapped.trace) == push[0]:
-            env.unwrapped.push(push[1])
+            _push(env, push[1])
         return np.zeros(env.action_space.shape, np.float32)
 
     row = rollout(env, act, Paths(env), seed=0)
     return row["measured"], row["commanded"], row
+
+
+def _push(env: Any, displacement: np.ndarray) -> None:
+    """Displace the robot, as a push by an operator between two control steps would."""
+    station = env.unwrapped.diagram.diagram.GetSubsystemByName("station")
+    context = env.unwrapped.simulator.get_mutable_context()
+    pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
+    station.set_pose(context, pose + displacement)
 
 
 def _recovery(

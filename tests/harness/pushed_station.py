@@ -8,6 +8,14 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 
 
+def push_robot(env, displacement):
+    """Displace the robot of an environment, as a push by an operator between two control steps would."""
+    station = env.diagram.diagram.GetSubsystemByName("station")
+    context = env.simulator.get_mutable_context()
+    pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
+    station.set_pose(context, pose + displacement)
+
+
 class PushedStation:
     """Simulated station with the connector's jack 0.5 m below its nominal pose.
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pushed_station import push_robot
 
 from guiderail import InputError, make_env
 from guiderail.diagrams.stations.workcell import Hull
@@ -61,7 +62,7 @@ def test_divergence_ends_the_episode():
     for displacement in (1e11, 1e300):
         env.reset(seed=3)
         env.step(np.zeros(2))
-        env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
+        push_robot(env, np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
         *_, terminated, truncated, info = env.step(np.zeros(2))
         assert (terminated, truncated) == (False, True)
         assert "the simulation failed in PhysX" in info["simulation_failure"]

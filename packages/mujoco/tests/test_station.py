@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pushed_station import push_robot
 from pydrake.math import RigidTransform
 
 from guiderail import InputError, make_env
@@ -173,7 +174,7 @@ def test_episode_is_bit_identical_for_the_same_seed(task):
     env = make_env(task, station="mujoco", action_repeat=25, fixture_offset="per_episode")
     first = run_episode(env, 3)
     assert not np.array_equal(run_episode(env, 4), first)
-    env.push(np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    push_robot(env, np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_array_equal(run_episode(env, 3), first)
 
 
@@ -215,7 +216,7 @@ def test_divergence_ends_the_episode_and_leaves_no_state(tmp_path, monkeypatch):
     for displacement in (1e11, 1e300):
         env.reset(seed=3)
         env.step(np.zeros(2))
-        env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
+        push_robot(env, np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
         observation, _, terminated, truncated, info = env.step(np.zeros(2))
         assert (terminated, truncated) == (False, True)
         assert "the simulation failed in MuJoCo" in info["simulation_failure"]

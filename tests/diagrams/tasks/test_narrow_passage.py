@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
+from pushed_station import push_robot
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import guiderail
@@ -203,7 +204,7 @@ def test_command_continues_at_the_pushed_pose(step, push, measuring):
     for k in range(80):
         if k == step:
             before = env.trace.commanded[-1].copy()
-            env.push(push)
+            push_robot(env, push)
         *_, info = env.step(zero_action(k))
         if k >= step:
             worst_after = max(worst_after, info["constraint_violation"])
@@ -221,7 +222,7 @@ def test_robot_returns_when_pushed_out_of_the_constraint():
     env.reset()
     for k in range(100):
         env.step(zero_action(k))
-    env.push([WORLD.zone_x + 0.05 - env.trace.measured[-1, 0], 0.0])
+    push_robot(env, [WORLD.zone_x + 0.05 - env.trace.measured[-1, 0], 0.0])
     *_, info = env.step(zero_action(0))
     assert info["constraint_violation"] <= 1e-9
     measured = []

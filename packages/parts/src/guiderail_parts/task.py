@@ -152,17 +152,31 @@ SOCKET_OFFSET, LAG = slice(11, 13), slice(16, 18)  # indices into "shared", both
 
 
 class PartUncertainty(BncUncertainty):
-    """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square."""
+    """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square.
+
+    With the option `fixture_turn`, the socket is also rotated about its axis, and its offset is [x, y, angle]. With the
+    reset option `offset`, it is not rotated.
+    """
 
     def __init__(self, options: PartInsertion):
-        super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
-        self.is_square = options.offset_shape == "square"
+        super().__init__(options.fixture_offset, offset_range=options.offset_range)
+        self.is_square, self.turn = options.offset_shape == "square", options.fixture_turn * DEGREE
+
+    def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
+        return self._append_turn(super()._draw_run(rng), rng)
 
     def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if not self.is_square:
-            return super()._draw_episode(rng, run)
-        side = self.offset_range[1]
-        return self._append_turn(rng.uniform(-side, side, 2), rng), np.zeros(2)
+        if self.is_square:
+            side = self.offset_range[1]
+            return self._append_turn(rng.uniform(-side, side, 2), rng), np.zeros(2)
+        socket, plug = super()._draw_episode(rng, run)
+        return (socket if self.kind == "per_run" else self._append_turn(socket, rng)), plug
+
+    def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.append(offset, 0.0) if self.turn > 0.0 else offset, np.zeros(2)
+
+    def _append_turn(self, socket: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return np.append(socket, rng.uniform(-self.turn, self.turn)) if self.turn > 0.0 else socket
 
 
 class ScriptedSearch:
