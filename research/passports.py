@@ -16,7 +16,7 @@ import numpy as np
 
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.tables import write_table
-from guiderail_studies.converge import ENGINES, evaluate_conditions, find_run, success_and_force
+from guiderail_studies.converge import evaluate_conditions, find_run, success_and_force
 from guiderail_studies.passport import installed_engines, passport_conditions, predict_left_out
 from research.command import Parser, print_result, run_program
 from research.stored import report
@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> None:
         possible = passport_conditions(
             config.task, subject.changed_environment({}), installed_engines(), lambda sentence: None
         )
-        defaults = {engine: next(c for c in possible if c.engine == engine) for engine in ENGINES}
+        defaults = {c.engine: c for c in reversed(possible)}  # the first condition of each engine
         found = [c for c in possible if c is defaults[c.engine] or (c.change and c.engine == CHANGED)]
         evaluated = evaluate_conditions(
             subject, found, out, episodes=args.episodes, seed=HELD_OUT_SEED, processes=args.processes
