@@ -69,7 +69,7 @@ def test_alias_of_a_reused_anchor_is_its_last_node():
             "more than 10000",
         ),
         ("\n".join(["k0: &k0 [1]"] + [f"k{i}: &k{i} [*k{i - 1}]" for i in range(1, 500)]), "inside each other"),
-        ("[" * 50_000, "inside each other"),
+        ("[" * 500, "inside each other"),
         ("- " * 5_000, "inside each other"),
         ("{a: " * 5_000, "inside each other"),
         ("? " * 5_000, "put it in quotes"),

@@ -1153,17 +1153,10 @@ def test_estimate_is_finite_when_the_state_is_not_finite(value):
     np.testing.assert_array_equal(estimate.state.velocity, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "period"),
-    [
-        *((tolerance, PERIOD) for tolerance in ((1.0,), (1.0,) * 3, 1.0, ("a", 1.0), ((1.0, 1.0),) * 2)),
-        *(((value, 1.0), PERIOD) for value in (0.0, np.inf, np.nan, -1.0)),
-        *((TOLERANCE, period) for period in (0.0, -PERIOD, np.nan, np.inf)),
-    ],
-)
-def test_constructor_refuses_arguments_out_of_range(tolerance, period):
+@pytest.mark.parametrize("tolerance", [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)])
+def test_constructor_refuses_a_tolerance_out_of_range(tolerance):
     with pytest.raises(InputError):
-        StateEstimator(LIMITS, tolerance, period=period)
+        StateEstimator(LIMITS, tolerance, period=PERIOD)
 
 
 def test_commanded_impulse_is_not_learned_when_the_command_ends():

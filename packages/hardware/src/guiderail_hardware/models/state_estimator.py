@@ -204,7 +204,7 @@ class StateEstimator:
         period: Period of the check [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If a torque tolerance is out of range, or missing.
     """
 
     def __init__(self, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float):
@@ -214,8 +214,6 @@ class StateEstimator:
             raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
         if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
             raise InputError("the torque tolerances of a robot must be positive and finite")
-        if not 0.0 < period < np.inf:
-            raise InputError(f"the period of an estimator must be positive, not {period} s")
         self._zeros, self._velocity_noise = np.zeros(n), np.full(n, limits.velocity_noise)
         self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
 
