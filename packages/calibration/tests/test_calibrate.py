@@ -15,7 +15,6 @@ from guiderail_calibration.parameters import select_parameters
 from guiderail_calibration.probe import probe_options, record_options
 from guiderail_calibration.recordings import load_recordings
 from guiderail_calibration.simulations import Simulator, draw_prior, simulate_all
-from guiderail_calibration.summaries import summarize
 
 RUN, GANTRY = "pretrained:connector", {"station": "gantry"}
 
@@ -32,16 +31,13 @@ def record(folder, environment, episodes):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    return record(tmp_path_factory.mktemp("calibration"), GANTRY, 2)
+    return record(tmp_path_factory.mktemp("calibration"), GANTRY, 1)
 
 
 def test_probing_motion_presses_within_the_force_limit(recorded):
-    episodes = load_recordings(recorded / "recordings")
-    assert len(episodes) == 2
-    for episode in episodes:
-        force = np.linalg.norm(episode.wrench[:, :3], axis=1)
-        assert 3.0 < force.max() < 20.0
-        assert np.ptp(episode.pose[25:37, 1]) > 1e-4  # slides on the rim
+    (episode,) = load_recordings(recorded / "recordings")
+    assert 3.0 < np.linalg.norm(episode.wrench[:, :3], axis=1).max() < 20.0
+    assert np.ptp(episode.pose[25:37, 1]) > 1e-4  # slides on the rim
 
 
 def test_probing_motion_shows_the_clearance_in_the_hole(recorded):
@@ -59,12 +55,6 @@ def test_probing_motion_shows_the_clearance_in_the_hole(recorded):
         play.append(np.ptp(episode.pose[112:137, 0]))
     assert play[0] < 5e-5
     assert play[1] > 1e-4
-
-
-def test_summaries_tell_robots_apart_more_than_episodes(recorded):
-    a, b = (summarize([episode], 151) for episode in load_recordings(recorded / "recordings"))
-    assert np.isfinite(a).all()
-    assert a.shape == b.shape
 
 
 def test_calibration_is_resumed_and_writes_its_files(tmp_path, monkeypatch):

@@ -133,8 +133,8 @@ class EstimatorState(NamedTuple):  # of which each check makes many copies, whic
 
     def shifted(self, seconds: float) -> "EstimatorState":
         """Return the state with all local times later, after a jump of the local clock [s]."""
-        names = ("check_time", "receipt_time", "fault_time", "doubt_time", "source_time")
-        names += ("last_offset", "accepted_offset")
+        times = ("check_time", "receipt_time", "fault_time", "doubt_time", "source_time")
+        names = (*times, "last_offset", "accepted_offset")
         return self._replace(**{name: getattr(self, name) + seconds for name in names})
 
     def reported_speed(self, period: float) -> float:
