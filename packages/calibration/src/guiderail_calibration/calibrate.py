@@ -203,16 +203,8 @@ def _write(out: Path, task: str, environment: Mapping[str, Any], calibration: Ca
     table = write_table(out / "posterior", rows).with_suffix(".csv")
     file = out / "variants.yaml"
     made = variants(task, environment, calibration.parameters, calibration.quantiles[-VARIANTS:])
-    write_atomically(file, yaml.safe_dump(_plain(made), sort_keys=False).encode())
+    plain = json.loads(json.dumps(made, default=np.generic.item))  # YAML has neither tuples nor numbers of NumPy
+    write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())
     write_atomically(out / "calibration.json", json.dumps(calibration.result(), indent=1).encode())
     write_atomically(out / "calibration.html", render(task, calibration).encode())
     return {"page": str(out / "calibration.html"), "posterior": str(table), "variants": str(file)}
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with lists in place of tuples, and numbers of Python in place of NumPy's."""
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value
