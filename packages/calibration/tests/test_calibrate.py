@@ -15,7 +15,6 @@ from guiderail_calibration.parameters import select_parameters
 from guiderail_calibration.probe import probe_options, record_options
 from guiderail_calibration.recordings import load_recordings
 from guiderail_calibration.simulations import Simulator, draw_prior, simulate_all
-from guiderail_calibration.summaries import summarize
 
 RUN, GANTRY = "pretrained:connector", {"station": "gantry"}
 
@@ -32,16 +31,13 @@ def record(folder, environment, episodes):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    return record(tmp_path_factory.mktemp("calibration"), GANTRY, 2)
+    return record(tmp_path_factory.mktemp("calibration"), GANTRY, 1)
 
 
 def test_probing_motion_presses_within_the_force_limit(recorded):
-    episodes = load_recordings(recorded / "recordings")
-    assert len(episodes) == 2
-    for episode in episodes:
-        force = np.linalg.norm(episode.wrench[:, :3], axis=1)
-        assert 3.0 < force.max() < 20.0
-        assert np.ptp(episode.pose[25:37, 1]) > 1e-4  # slides on the rim
+    (episode,) = load_recordings(recorded / "recordings")
+    assert 3.0 < np.linalg.norm(episode.wrench[:, :3], axis=1).max() < 20.0
+    assert np.ptp(episode.pose[25:37, 1]) > 1e-4  # slides on the rim
 
 
 def test_probing_motion_shows_the_clearance_in_the_hole(recorded):
@@ -61,30 +57,24 @@ def test_probing_motion_shows_the_clearance_in_the_hole(recorded):
     assert play[1] > 1e-4
 
 
-def test_summaries_tell_robots_apart_more_than_episodes(recorded):
-    a, b = (summarize([episode], 151) for episode in load_recordings(recorded / "recordings"))
-    assert np.isfinite(a).all()
-    assert a.shape == b.shape
-
-
 def test_calibration_is_resumed_and_writes_its_files(tmp_path, monkeypatch):
     # One recorded episode, few draws of one episode each, and one flow: more are for coverage, not tested here. With
     # the coarse time step, the motion shows the stiffness but does not enter the hole.
     coarse = GANTRY | {"time_step": 0.01}
     recordings = record(tmp_path, coarse, 1) / "recordings"
     monkeypatch.setitem(simulate_all.__kwdefaults__, "episodes", 1)
-    monkeypatch.setattr("guiderail_calibration.calibrate.MIN_DRAWS", 12)
+    monkeypatch.setattr("guiderail_calibration.calibrate.MIN_DRAWS", 8)
     monkeypatch.setattr("guiderail_calibration.calibrate.EPISODES_OF_PREDICTION", 1)
     monkeypatch.setattr("guiderail_calibration.inference.MEMBERS", 1)
     sentences = []
     arguments = {
-        "probe": tmp_path / "probe.npz", "environment": coarse, "parameters": ["stiffness"], "draws": 12,
+        "probe": tmp_path / "probe.npz", "environment": coarse, "parameters": ["stiffness"], "draws": 8,
         "predicted": 1, "out": tmp_path / "out", "processes": 1, "log": sentences.append,
     }  # fmt: skip
     result = calibrate(RUN, recordings, **arguments)
     (row,) = result["parameters"]
     assert row["identifiable"] == "yes"
-    # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 12 draws.
+    # Coverage of the intervals needs many robots (`python -m research.calibration`); this is one, with 8 draws.
     assert row["low"] > 1.0  # the robot is stiffer than the nominal one
     assert np.sqrt(row["low"] * row["high"]) == pytest.approx(1.7, rel=0.2)
     assert row["high"] / row["low"] < 0.5 * row["prior_high"] / row["prior_low"]

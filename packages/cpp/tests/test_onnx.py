@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import onnxruntime
@@ -122,7 +123,7 @@ def measured_signals(skill, observation):
     return signals
 
 
-def test_export_is_refused_in_one_sentence(tmp_path, capsys):
+def test_export_is_refused_in_one_sentence(tmp_path, capsys, monkeypatch):
     (tmp_path / "full").mkdir()
     for arguments, message in (
         (["pretrained:passage", "--out", str(tmp_path / "full")], "already exists"),
@@ -133,10 +134,11 @@ def test_export_is_refused_in_one_sentence(tmp_path, capsys):
             main(["export", *arguments])
         assert end.value.code == 2
         assert message in capsys.readouterr().err
-    image = Policy.__new__(Policy)
-    image._layers, image.description = [], {"observation_shape": [8, 8, 3]}
-    with pytest.raises(InputError, match="observes images"):
-        policy_to_onnx(image)
+    for image in ({"observation_shape": [8, 8, 3]}, {"observation_shape": [9], "image_shape": [2, 2, 1]}):
+        policy = SimpleNamespace(description=image)
+        monkeypatch.setattr("guiderail_cpp.skill.Policy.load", lambda _, policy=policy: policy)
+        with pytest.raises(InputError, match="observes images"):
+            export_onnx("pretrained:passage", tmp_path / "new")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.figures import new_figure, plot_run
-from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, draw_runs, write_report
+from guiderail_studies.report import SAFETY_COLUMNS, _safety, draw_runs, to_svg, write_report
 from guiderail_studies.report_data import _stored_episodes, command, gather
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
@@ -240,7 +240,7 @@ def test_report_leaves_out_the_figure_of_a_missing_column(study_folder, tmp_path
 
 def test_description_of_a_figure_is_escaped_in_xml():
     figure, _ = new_figure(1, 1, (1.0, 1.0))
-    element = ElementTree.fromstring(_svg(figure, 'success of "my" <task> & more'))
+    element = ElementTree.fromstring(to_svg(figure, 'success of "my" <task> & more'))
     assert element.attrib["aria-label"] == 'success of "my" <task> & more'
 
 

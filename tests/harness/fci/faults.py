@@ -27,7 +27,7 @@ from guiderail_hardware.drivers.lcm import MICROSECOND, IiwaDriver
 from guiderail_hardware.models.joint_status import JointStatus
 from guiderail_hardware.robot.connection import subprocess_tied_to_parent
 from guiderail_hardware.robot.sim_driver import START
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import STOPPED
 
 CENTER = START + np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
 AMPLITUDE, FREQUENCY = (
@@ -108,7 +108,7 @@ class Campaign:
     @property
     def is_stopped(self) -> bool:
         """True if the arm is being stopped."""
-        return self.run["arm_state"][0] in (ArmState.DAMPING, ArmState.OFF)
+        return self.run["arm_state"][0] in STOPPED
 
     def move(self, seconds: float) -> float:
         """Move without a fault for `seconds` [s]; return the largest joint speed [rad/s]."""

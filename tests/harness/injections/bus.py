@@ -21,7 +21,7 @@ from guiderail_hardware.models.joint_status import Fault
 from guiderail_hardware.monitor import MonitorState, SafetyMonitor
 from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import CONTROLLED, STOPPED, ArmState
 
 PERIOD = IiwaDriver.period
 STOPPED_WITHIN = 0.05  # time from the detection of a fault to standstill [s]
@@ -174,7 +174,7 @@ class Bus:
     @property
     def is_detected(self) -> bool:
         """True if the station or the safety monitor is stopping the arm."""
-        is_stopping = self.has_controller and self.arm_state in (ArmState.DAMPING, ArmState.OFF)
+        is_stopping = self.has_controller and self.arm_state in STOPPED
         return (
             is_stopping
             or (self.has_controller and self.fault != Fault.NONE)
@@ -295,9 +295,7 @@ class Bus:
                 observation.detected, observation.fastest = elapsed, speed
                 observation.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
             # A restarted station moves the arm again without `resume`: the speed of this motion is not counted.
-            is_moving_again = (
-                self.has_controller and self.arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
-            )
+            is_moving_again = self.has_controller and self.arm_state in CONTROLLED and not self.is_detected
             if (
                 observation.detected is not None
                 and self.has_robot

@@ -50,7 +50,7 @@ from guiderail_hardware.models.joint_status import Fault
 from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import STOPPED, ArmState
 from injections.campaign import DURATION, MAX_STEPS, SENSITIVITY, SLOW, SLOW_AFTER, Result, has_effect, print_table
 from injections.campaign import random_pairs as pairs_of
 from injections.kinds import FIELDS, GROWTH, KINDS, NEXT, PERIOD, UNDETECTED, Kind, Q
@@ -476,7 +476,7 @@ class Campaign:
     @property
     def is_detected(self) -> bool:
         """True if the station is stopping the arm."""
-        return self.has_controller and (self.arm_state in (ArmState.DAMPING, ArmState.OFF) or self.fault != Fault.NONE)
+        return self.has_controller and (self.arm_state in STOPPED or self.fault != Fault.NONE)
 
     def run_until_following(self) -> None:
         """Advance until the arm follows its command, and resume it when it is stopped."""

@@ -69,13 +69,12 @@ def test_alias_of_a_reused_anchor_is_its_last_node():
             "more than 10000",
         ),
         ("\n".join(["k0: &k0 [1]"] + [f"k{i}: &k{i} [*k{i - 1}]" for i in range(1, 500)]), "inside each other"),
-        ("[" * 50_000, "inside each other"),
+        ("[" * 500, "inside each other"),
         ("- " * 5_000, "inside each other"),
         ("{a: " * 5_000, "inside each other"),
         ("? " * 5_000, "put it in quotes"),
         ("&a [*a]", "contains itself"),
         ("a: &a {b: *a}", "contains itself"),
-        ("- x\n" * 10_001, "more than 10000 entries"),
         ("x" * 100_001, "longer than"),
         ("a: 1\na: 2", 'duplicate key "a"'),
         ("1: 2", "put it in quotes"),
@@ -108,6 +107,12 @@ def test_invalid_document_is_refused_in_one_line(text, reason):
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300
     assert peak < 30e6
+
+
+def test_list_of_too_many_entries_is_refused(monkeypatch):
+    monkeypatch.setattr("guiderail.models.common.yaml.MAX_ENTRIES", 100)
+    with pytest.raises(InputError, match="more than 100 entries"):
+        parse_yaml("- x\n" * 101)
 
 
 @pytest.mark.parametrize(

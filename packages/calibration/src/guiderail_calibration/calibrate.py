@@ -14,10 +14,8 @@ import yaml
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.tools.evaluation.forks import check_processes
-from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.tables import write_table
 from guiderail_calibration.inference import Posterior
 from guiderail_calibration.parameters import Parameter, options_of, select_parameters
@@ -34,6 +32,7 @@ from guiderail_calibration.simulations import (
     simulate_all,
 )
 from guiderail_calibration.summaries import summarize
+from guiderail_studies.converge import find_run
 
 DRAWS = 240  # default number of simulated draws of the prior
 MIN_DRAWS = 40
@@ -130,13 +129,9 @@ def calibrate(
     draws = as_whole(draws, "the number of draws of the prior", MIN_DRAWS)
     predicted = as_whole(predicted, "the number of draws of a prediction", 0)
     processes = check_processes(processes)
-    subject = find_subject(run, None, environment)
+    subject, out = find_run(run, environment, out, "calibration", trust_policy=False)
     config = subject.config
     assert config is not None  # a run has one
-    if out is None:
-        if subject.folder is None or not subject.is_stored:
-            raise InputError("a policy without a folder needs one for the results: give --out")
-        out = subject.folder.path / "calibration"
     base = subject.changed_environment(dict(environment or {}))
     selected, left_out = select_parameters(config.task, base, parameters)
     policy = Simulator(config.task, base, selected, subject.make_policy, str(subject.digest))
@@ -203,16 +198,8 @@ def _write(out: Path, task: str, environment: Mapping[str, Any], calibration: Ca
     table = write_table(out / "posterior", rows).with_suffix(".csv")
     file = out / "variants.yaml"
     made = variants(task, environment, calibration.parameters, calibration.quantiles[-VARIANTS:])
-    write_atomically(file, yaml.safe_dump(_plain(made), sort_keys=False).encode())
+    plain = json.loads(json.dumps(made, default=np.generic.item))  # YAML has neither tuples nor numbers of NumPy
+    write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())
     write_atomically(out / "calibration.json", json.dumps(calibration.result(), indent=1).encode())
     write_atomically(out / "calibration.html", render(task, calibration).encode())
     return {"page": str(out / "calibration.html"), "posterior": str(table), "variants": str(file)}
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with lists in place of tuples, and numbers of Python in place of NumPy's."""
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,11 @@ from guiderail.tools.visualization.figures import new_figure
 from guiderail_calibration.inference import describe_check
 from guiderail_calibration.prediction import LEVEL
 from guiderail_calibration.recordings import Episode
+from guiderail_studies.report import STYLE, to_svg
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
 )
-STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
 RECORDED, SIMULATED = "#1c1f24", "#1f5fbf"
 
 
@@ -62,7 +60,7 @@ def _posterior(calibration: Any) -> str:
             axis.set_xticks(ticks, [f"{value:.3g}" for value in parameter.value(ticks)])
             axis.set_yticks([])
             axis.set_title(parameter.axis.label, fontsize=8.5)
-        return _svg(figure, "posterior of each parameter; the dashed line is its prior")
+        return to_svg(figure, "posterior of each parameter; the dashed line is its prior")
 
 
 def _signals(recorded: Sequence[Episode], simulated: Sequence[Episode]) -> str:
@@ -85,12 +83,4 @@ def _signals(recorded: Sequence[Episode], simulated: Sequence[Episode]) -> str:
                     error.set_title(f"tracking error along {letter} [mm]", fontsize=8.5)
                     error.set_xlabel("time [s]")
         axes[0, 0].legend(frameon=False, fontsize=8)
-        return _svg(figure, "recorded and simulated forces and tracking errors")
-
-
-def _svg(figure: Any, description: str) -> str:
-    """Return a figure as an SVG element, whose aspect ratio does not depend on its width."""
-    content = io.StringIO()
-    figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
-    text = content.getvalue()
-    return text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)
+        return to_svg(figure, "recorded and simulated forces and tracking errors")

@@ -10,7 +10,6 @@ import numpy as np
 
 from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
-from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PRIMITIVE_FILE, SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
@@ -77,8 +76,6 @@ export_onnx = Exporter(GUIDED, EXPORTED, _onnx_files)
 def policy_to_onnx(policy: Policy) -> bytes:
     """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n)."""
     layers, description = policy.layers, policy.description
-    if len(description["observation_shape"]) != 1 or "image_shape" in description:
-        raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     nodes: list[tuple[str, Sequence[str], str]] = []
     tensors: dict[str, np.ndarray] = {}
     value = "observation"

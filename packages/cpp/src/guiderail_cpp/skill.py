@@ -133,8 +133,6 @@ def _plain(value: Any) -> Any:
 def _observation(declared: Observed, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
     """Return the entries of the observation, each clip((value − center) / scale); there are `observed` of them."""
     terms = declared.terms
-    if declared.camera is not None:
-        raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     sizes = [_size(term, pose_size) for term in terms]
     if sizes.count(1) and observed > sum(sizes):  # one signal whose size neither its name nor its scale tells
         unknown = [i for i, term in enumerate(terms) if term.signal not in NAMES and sizes[i] == 1]

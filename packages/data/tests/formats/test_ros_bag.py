@@ -1,7 +1,6 @@
 """ROS bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
 
 from functools import cache
-from itertools import product
 
 import numpy as np
 import pytest
@@ -236,21 +235,21 @@ KINDS = {
 FRAMES = [("base_link", "tool"), ("world", "tool"), ("", "tool"), ("base_link", "camera")]
 
 
-@pytest.mark.parametrize(("kind", "second"), list(product(KINDS, range(len(FRAMES)))))
-@pytest.mark.parametrize("target", [None, (0.5, 0.0, 0.2, 0.0, 0.0, 0.0)])
-@pytest.mark.parametrize("is_within", [True, False])
-def test_poses_in_different_frames_are_refused(kind, second, target, is_within, tmp_path):
+# Frames are read from each kind of message, and those of two bags are compared whatever the kind.
+@pytest.mark.parametrize(("kind", "is_within"), [*((kind, True) for kind in KINDS), ("Odometry", False)])
+@pytest.mark.parametrize("second", range(len(FRAMES)))
+def test_poses_in_different_frames_are_refused(kind, second, is_within, tmp_path):
     has_child = kind in ("TransformStamped", "Odometry")
     first, other = ((frame, child if has_child else "") for frame, child in (FRAMES[0], FRAMES[second]))
     sequences = [[first] * 3 + [other] * 3] if is_within else [[first] * 3, [other] * 3]
     for number, sequence in enumerate(sequences):
         write(tmp_path / f"bag_{number}", KINDS[kind], in_frame(kind), sequence)
     if first == other:
-        assert read_bags(tmp_path, None, target).frames == first
+        assert read_bags(tmp_path, None, None).frames == first
         return
     differing = next(name or "unnamed" for a, name in zip(first, other, strict=True) if a != name)
     with pytest.raises(InputError, match=differing) as error:
-        read_bags(tmp_path, None, target)
+        read_bags(tmp_path, None, None)
     assert "base_link" in str(error.value)
 
 

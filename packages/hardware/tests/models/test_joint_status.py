@@ -67,26 +67,24 @@ INVALID_VALUES += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="da
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("value", INVALID_VALUES, ids=str)
 def test_field_of_wrong_type_is_malformed(field, value):
-    changed = replace(status(), **{field: value})
-    assert check_status(changed, LAST, 116.0, LIMITS) == Fault.MALFORMED
-    assert parse_status(changed) is MALFORMED_STATUS
+    assert parse_status(replace(status(), **{field: value})) is MALFORMED_STATUS
 
 
 @pytest.mark.parametrize("field", ["time", "conflicts", "foreign_commands"])
 @pytest.mark.parametrize("value", ["now", None, 1j, True, [16.0], np.zeros(2), Unreadable()], ids=str)
 def test_scalar_of_wrong_type_is_malformed(field, value):
-    assert check_status(replace(status(), **{field: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+    assert parse_status(replace(status(), **{field: value})) is MALFORMED_STATUS
 
 
 @pytest.mark.parametrize("field", ["conflicts", "foreign_commands"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_counter_that_is_not_finite_is_malformed(field, value):
-    assert check_status(replace(status(), **{field: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+    assert parse_status(replace(status(), **{field: value})) is MALFORMED_STATUS
 
 
 @pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, Unreadable()], ids=str)
 def test_object_of_another_type_is_malformed(value):
-    assert check_status(value, LAST, 116.0, LIMITS) == Fault.MALFORMED
+    assert parse_status(value) is MALFORMED_STATUS
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -102,7 +100,7 @@ def test_parsed_status_has_the_same_numbers_in_its_own_arrays():
     np.testing.assert_array_equal(parsed.values(), original.values())
     original.positions[0] = 7.0
     assert parsed.positions[0] == 0.5
-    assert check_status(replace(status(), positions=[0, -1]), LAST, 116.0, LIMITS) == Fault.POSITION_JUMP
+    np.testing.assert_array_equal(parse_status(replace(status(), positions=[0, -1])).positions, [0.0, -1.0])
     assert parse_status(None) is None
 
 

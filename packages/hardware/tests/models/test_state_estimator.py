@@ -121,7 +121,7 @@ def test_fault_is_reported_during_the_settling_time():
 def test_fault_and_doubt_end_after_the_settling_time(share, is_over):
     rig = Rig().settle()
     since = rig.now + 2.0 * PERIOD - share * LIMITS.settling_time  # [s], at the check after the next check
-    rig.state = replace(rig.state, fault=float(Fault.FUTURE), fault_time=since, doubt_time=since)
+    rig.state = rig.state._replace(fault=float(Fault.FUTURE), fault_time=since, doubt_time=since)
     rig.check()
     assert (rig.state.fault == Fault.NONE, np.isnan(rig.state.doubt_time)) == (is_over, is_over)
 
@@ -220,7 +220,7 @@ def test_prediction_is_exact_without_external_torque():
 @pytest.mark.parametrize(("share", "is_known"), [(1.0, True), (1.0005, False)])
 def test_velocity_is_unknown_after_the_prediction_time(share, is_known):
     rig = Rig()
-    rig.state = replace(rig.state, accepted_time=0.0, velocity=CRUISE)
+    rig.state = rig.state._replace(accepted_time=0.0, velocity=CRUISE)
     rig.check(None, gap=share * module.MAX_PREDICTION_TIME)
     assert rig.estimate.state.velocity.any() == is_known
 
@@ -307,7 +307,7 @@ def test_offset_follows_early_statuses_by_a_fraction():
 def test_sum_of_early_statuses_is_checked_at_its_limit(share, fault):
     rig = Rig(velocity=np.zeros(2)).settle()
     early, offset = share * (module.MAX_EARLY * LIMITS.max_lead), rig.state.last_offset
-    rig.state = replace(rig.state, early=early, receipt_time=rig.now + PERIOD)  # so that the sum does not decay
+    rig.state = rig.state._replace(early=early, receipt_time=rig.now + PERIOD)  # so that the sum does not decay
     late = 0.25 * PERIOD
     assert rig.check(shifted(time=-late)) == fault
     expected = (offset + late, 0.0) if fault else (offset + LIMITS.clock_drift * PERIOD, early)
@@ -489,7 +489,7 @@ def test_counters_restart_when_values_change():
 def test_equal_values_are_counted_above_the_minimum_motion(counter, joint, before, after, sign, share, count):
     before, after = (sign * share * np.array([*values, 0.0, 0.0]) for values in (before, after))
     rig = Rig(velocity=np.zeros(2)).settle()
-    rig.state = replace(rig.state, last_values=before)
+    rig.state = rig.state._replace(last_values=before)
     rig.check(lambda true: JointStatus(true.time, *np.split(after, 3)))
     assert getattr(rig.state, counter)[joint] == count
 
@@ -660,7 +660,7 @@ def test_unexplained_statuses_are_used_again_with_another_fault():
 def test_reported_speed_is_that_of_a_fresh_status(age, speed):
     """It differs from the velocity estimate, which may be a prediction."""
     rig = Rig().settle()
-    rig.state = replace(rig.state, velocity=np.zeros(2))
+    rig.state = rig.state._replace(velocity=np.zeros(2))
     for _ in range(age):
         rig.check(None)
     assert rig.estimate.state.reported_speed(PERIOD) == pytest.approx(speed, nan_ok=True, abs=1e-6)
@@ -671,7 +671,7 @@ def test_reported_speed_is_that_of_a_fresh_status(age, speed):
 )
 def test_increase_of_a_large_counter_is_a_fault(name, fault):
     rig = Rig().settle()
-    rig.state = replace(rig.state, **{name: 2000.0})
+    rig.state = rig.state._replace(**{name: 2000.0})
     assert rig.check(lambda true: replace(true, **{name: 2000})) == Fault.NONE
     assert rig.check(lambda true: replace(true, **{name: 2001})) == fault
 
@@ -755,7 +755,7 @@ def test_reaction_is_checked_at_its_tolerance(share, is_fault):
     push = share * total / ((1.0 - module.MODEL_ERROR) * inverse[0, 0])
     rig = Rig(velocity=np.zeros(2)).settle()
     rig.estimator._limited_bias = lambda bias: np.zeros(2)  # see test_constant_error_of_a_torque_is_learned
-    rig.state = replace(rig.state, bias=np.zeros(2))
+    rig.state = rig.state._replace(bias=np.zeros(2))
     frozen_status = rig.status()
     result = rig.detected(lambda status: replace(frozen_status, time=status.time), 400, rig.balance + [push, 0.0])
     assert (result is not None) == is_fault
@@ -769,8 +769,8 @@ def test_momentum_is_checked_at_its_tolerance(joint, share, fault):
     decay = np.exp(-PERIOD / module.MOMENTUM_WINDOW)
     allowed = LIMITS.velocity_noise + decay * PERIOD * np.abs(np.linalg.inv(M)) @ TOLERANCE
     names = ("velocity", "bias", "measured", "commanded", "reaction", "tolerance", "variation", "external")
-    rig.state = replace(rig.state, **dict.fromkeys(names, zero), last_values=np.zeros(6))
-    rig.state = replace(rig.state, predicted=M @ (share * allowed * np.eye(2)[joint]) / decay, torque=zero + 1e-9)
+    rig.state = rig.state._replace(**dict.fromkeys(names, zero), last_values=np.zeros(6))
+    rig.state = rig.state._replace(predicted=M @ (share * allowed * np.eye(2)[joint]) / decay, torque=zero + 1e-9)
     assert rig.check(shifted(velocities=-rig.status().velocities)) == fault
 
 
@@ -853,7 +853,7 @@ def test_velocity_is_the_median_of_three_sources():
     ):
         rig = Rig().settle()
         true = rig.v.copy()
-        rig.state = replace(rig.state, torque=rig.state.torque + torque_error)
+        rig.state = rig.state._replace(torque=rig.state.torque + torque_error)
         rig.check(shifted(**changed))
         np.testing.assert_allclose(rig.estimate.state.velocity, true, atol=1e-6)
 
@@ -862,8 +862,8 @@ def test_velocity_is_the_median_without_commanded_torque():
     """Without commanded torque the momentum sums are zero, so that a frozen position does not change the median."""
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     last = np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
-    rig.state = replace(rig.state, torque=np.zeros(2), velocity=np.array([0.3, 0.0]), last_values=last)
-    rig.state = replace(rig.state, equal_positions=np.array([1.0, 0.0]))
+    rig.state = rig.state._replace(torque=np.zeros(2), velocity=np.array([0.3, 0.0]), last_values=last)
+    rig.state = rig.state._replace(equal_positions=np.array([1.0, 0.0]))
     assert rig.check(lambda true: JointStatus(true.time, *np.split(last, 3))) == Fault.FROZEN
     np.testing.assert_allclose(rig.state.velocity, [0.3, 0.0], atol=1e-3)
 
@@ -891,7 +891,7 @@ def test_predicted_external_torque_has_a_limited_rate():
 def rig_in_doubt(**arguments):
     rig = Rig(**arguments).settle()
     rig.check(FALSIFIED[Fault.MALFORMED])
-    rig.state = replace(rig.state, doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
+    rig.state = rig.state._replace(doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
     return rig
 
 
@@ -949,7 +949,7 @@ def test_status_in_doubt_must_be_fresh(late, is_accepted):
 def test_status_in_doubt_must_agree_up_to_the_tolerances(index, share, is_accepted):
     """The accepted status and the prediction are zero, so that the difference is exact."""
     rig, zero = rig_in_doubt(velocity=np.zeros(2), external=np.zeros(2)), np.zeros(2)
-    rig.state = replace(rig.state, velocity=zero, torque=zero, bias=zero, accepted_values=np.zeros(6))
+    rig.state = rig.state._replace(velocity=zero, torque=zero, bias=zero, accepted_values=np.zeros(6))
     values = share * np.array([LIMITS.position_tolerance] * 2 + [module.AGREEMENT] * 2 + [0.0] * 2) * np.eye(6)[index]
     rig.check(lambda true: JointStatus(true.time, *np.split(values, 3)))
     assert rig.estimate.is_new == is_accepted
@@ -1112,7 +1112,7 @@ def test_velocity_is_predicted_when_old_values_arrive():
 @pytest.mark.parametrize(("reported", "expected"), [(0.05, 0.05), (-0.02, 0.0), (0.12, 0.08)])
 def test_velocity_in_doubt_is_limited_to_the_prediction(reported, expected):
     rig = Rig(velocity=[0.08, 0.0], external=np.zeros(2)).settle()
-    rig.state = replace(rig.state, doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
+    rig.state = rig.state._replace(doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now)
     error = np.array([reported - 0.08, 0.0])
     rig.check(shifted(velocities=error, positions=PERIOD * error))
     assert rig.estimate.is_new
@@ -1148,22 +1148,15 @@ def test_torque_that_is_not_finite_counts_as_zero():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_estimate_is_finite_when_the_state_is_not_finite(value):
     rig = Rig().settle()
-    state = replace(rig.state, velocity=np.array([value, 0.1]))
+    state = rig.state._replace(velocity=np.array([value, 0.1]))
     estimate = rig.estimator.evaluate(state, None, rig.now + PERIOD, M, np.zeros(2))
     np.testing.assert_array_equal(estimate.state.velocity, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "period"),
-    [
-        *((tolerance, PERIOD) for tolerance in ((1.0,), (1.0,) * 3, 1.0, ("a", 1.0), ((1.0, 1.0),) * 2)),
-        *(((value, 1.0), PERIOD) for value in (0.0, np.inf, np.nan, -1.0)),
-        *((TOLERANCE, period) for period in (0.0, -PERIOD, np.nan, np.inf)),
-    ],
-)
-def test_constructor_refuses_arguments_out_of_range(tolerance, period):
+@pytest.mark.parametrize("tolerance", [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)])
+def test_constructor_refuses_a_tolerance_out_of_range(tolerance):
     with pytest.raises(InputError):
-        StateEstimator(LIMITS, tolerance, period=period)
+        StateEstimator(LIMITS, tolerance, period=PERIOD)
 
 
 def test_commanded_impulse_is_not_learned_when_the_command_ends():
@@ -1221,7 +1214,7 @@ def test_statuses_are_compared_up_to_the_maximum_age(periods, is_compared):
     rig = Rig(limits=replace(LIMITS, max_age=8 * PERIOD, max_lead=1.0)).settle()
     rig.check(lambda true: replace(true, positions=true.positions + 4e-4))
     counters = ("equal_positions", "equal_velocities", "equal_values")
-    before = rig.state = replace(rig.state, **dict.fromkeys(counters, np.ones(2)))
+    before = rig.state = rig.state._replace(**dict.fromkeys(counters, np.ones(2)))
     assert before.residual.any()
     rig.check(lambda true: replace(true, time=before.last_time + periods * PERIOD), gap=periods * PERIOD)
     assert rig.state.residual.any() == is_compared

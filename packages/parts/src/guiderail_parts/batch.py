@@ -55,7 +55,6 @@ def create_tasks(
     *,
     processes: int = 1,
     retry: bool = False,
-    cpu_seconds: int = CPU_SECONDS,
     log: Callable[[str], None] = lambda sentence: None,
     **options: Any,
 ) -> dict[str, dict[str, Any]]:
@@ -70,7 +69,6 @@ def create_tasks(
         out: Folder; an existing one is continued.
         processes: Number of pairs that are prepared at the same time.
         retry: True to prepare refused pairs again.
-        cpu_seconds: CPU time after which the preparation of a pair is stopped [s].
         log: Function called with a sentence on each finished pair.
         options: Options of `create_task` for all pairs; a pair's own options replace them.
 
@@ -94,7 +92,7 @@ def create_tasks(
                 stream.flush()
 
             try:
-                result = run_isolated(_prepare, pair, folder, write, options, cpu_seconds=cpu_seconds)
+                result = run_isolated(_prepare, pair, folder, write, options, cpu_seconds=CPU_SECONDS)
             except IsolatedError as error:
                 result = {"error": str(error)}
             if "error" in result:

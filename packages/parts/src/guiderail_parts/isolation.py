@@ -11,8 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from guiderail.models.common.arrays import as_whole
-
 _WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the limit of CPU time, plus a constant [s]
 
 
@@ -26,15 +24,13 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     Args:
         function: Function; it need not be importable, because the child process is a copy of the calling process.
         arguments: Arguments of the function, which are not pickled.
-        cpu_seconds: Limit of the function's CPU time, a whole number of at least 1 [s].
+        cpu_seconds: Limit of the function's CPU time [s].
         max_bytes: Limit of the memory that the function allocates [bytes]; no limit by default.
 
     Raises:
-        InputError: If `cpu_seconds` is not a whole number of at least 1.
         IsolatedError: If the function raised, its result cannot be pickled, or its process aborted, was killed or
             exceeded a limit.
     """
-    cpu_seconds = as_whole(cpu_seconds, "cpu_seconds", 1)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_run_child, args=(sender, function, arguments, cpu_seconds, max_bytes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -460,15 +461,7 @@ def write_task_file(folder: Path, file: PartTaskFile) -> Path:
         InputError: If the file cannot be written.
     """
     path = folder / FILE_NAME
-    values = _plain(file.model_dump())
+    values = json.loads(json.dumps(file.model_dump()), parse_float=lambda digits: float(f"{float(digits):.9g}"))
     text = yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None)
     write_atomically(path, text.encode())
     return path
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return float(f"{value:.9g}") if isinstance(value, float) else value

@@ -190,7 +190,7 @@ def find_run(
     subject = find_subject(policy, None, environment, trust_policy=trust_policy)
     if out is None:
         if subject.folder is None or not subject.is_stored:
-            raise InputError("a policy without a folder needs one for the table: give --out")
+            raise InputError("a policy without a folder needs one for the results: give --out")
         out = subject.folder.path / name
     return subject, out
 

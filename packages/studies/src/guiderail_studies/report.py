@@ -284,7 +284,7 @@ def _curve(data: ReportData, task: str, column: str, label: str) -> str:
         if column == "success":
             axis.set_ylim(-0.04, 1.04)
         legend_above(axis, columns=2)
-        return _svg(figure, f"{label} over the training episodes of {task}")
+        return to_svg(figure, f"{label} over the training episodes of {task}")
 
 
 def _survival_curve(data: ReportData, task: str) -> str:
@@ -304,7 +304,7 @@ def _survival_curve(data: ReportData, task: str) -> str:
         axis.set(xlabel="training episodes", ylabel="fraction not converged", ylim=(-0.04, 1.04))
         axis.set_xlim(left=0)
         legend_above(axis, columns=2)
-        return _svg(figure, f"fraction of the runs of {task} that have not converged, over the training episodes")
+        return to_svg(figure, f"fraction of the runs of {task} that have not converged, over the training episodes")
 
 
 def _held_out_figure(data: ReportData) -> str:
@@ -336,14 +336,14 @@ def _held_out_figure(data: ReportData) -> str:
         )
         axis.grid(axis="x", color="0.9")
         axis.set_axisbelow(True)
-        return _svg(figure, "success on held-out episodes, each seed with its Wilson interval")
+        return to_svg(figure, "success on held-out episodes, each seed with its Wilson interval")
 
 
 def _label(name: str, runs: list[Run]) -> str:
     return f"{name} ({_count(len(runs), 'seed')})"
 
 
-def _svg(figure: Any, description: str) -> str:
+def to_svg(figure: Any, description: str) -> str:
     """Return a figure as an SVG element, whose aspect ratio does not depend on its width."""
     content = io.StringIO()
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})

@@ -224,12 +224,11 @@ class LastStatus:
 
 
 def check_content(status: JointStatus | None, num_joints: int) -> Fault:
-    """Check types, sizes and finiteness of one status; None before the first message.
+    """Check sizes and finiteness of a result of `parse_status`; None before the first message.
 
     Returns:
-        The first fault, or `Fault.NONE`. The fault of a status that `parse_status` refuses is `Fault.MALFORMED`.
+        The first fault, or `Fault.NONE`.
     """
-    status = parse_status(status)
     if status is None:
         return Fault.NO_STATUS
     if not status.is_readable:
@@ -240,7 +239,7 @@ def check_content(status: JointStatus | None, num_joints: int) -> Fault:
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Check the newest status (None before the first message) against the last one at the local time `now` [s].
+    """Check a result of `parse_status` (None before the first message) against the last one at the time `now` [s].
 
     Returns:
         The first fault, or `Fault.NONE`; the faults of `check_content` come first.

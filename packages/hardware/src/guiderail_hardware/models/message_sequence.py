@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
 from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, JointStatus
 
 REVERSAL = 1.5  # largest change of a joint velocity between statuses, as in a collision [rad/s]
@@ -33,12 +32,7 @@ class StatusSequence:
     """
 
     def __init__(self, period: float):
-        """Construct the sequence of statuses with the nominal period `period` [s].
-
-        Raises:
-            InputError: If the period is not positive and finite.
-        """
-        _check_period(period)
+        """Construct the sequence of statuses with the nominal period `period` [s]."""
         self.num_conflicts = 0
         self._period, self._max_interval = period, MAX_MISSED_MESSAGES * period
         self._short_time = -np.inf  # time stamp after the last short interval [s]
@@ -91,12 +85,7 @@ class CommandSequence:
     """
 
     def __init__(self, period: float):
-        """Construct the sequence of commands that one program sends every `period` [s].
-
-        Raises:
-            InputError: If the period is not positive and finite.
-        """
-        _check_period(period)
+        """Construct the sequence of commands that one program sends every `period` [s]."""
         self.num_conflicts = 0
         self._period, self._max_delay = period, MAX_MISSED_MESSAGES * period
         self._last = (np.nan, -np.inf)  # time stamp of the last command, and local time of its arrival [s]
@@ -124,8 +113,3 @@ class CommandSequence:
             self._before_jump = self._last
         self.num_conflicts += bool(is_contradictory)
         self._last, self._torque = (time, now), torque
-
-
-def _check_period(period: float) -> None:
-    if not 0.0 < period < np.inf:
-        raise InputError(f"the period of messages must be positive, not {period} s")

@@ -4,7 +4,8 @@ The hardware station (`StatusWatchdog`) and the safety monitor use it. docs/robo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,8 +68,7 @@ MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity
 NUM_SCALARS = 13  # number of scalars of `EstimatorState`, which precede its vectors
 
 
-@dataclass(frozen=True)
-class EstimatorState:
+class EstimatorState(NamedTuple):  # of which each check makes many copies, which take longer in a dataclass
     """State of the estimator between two checks."""
 
     check_time: float  # local time of the next check [s]
@@ -117,31 +117,25 @@ class EstimatorState:
     def initial(cls, num_joints: int) -> "EstimatorState":
         """Return the state before the first check."""
         scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
-        num_vectors = len(fields(cls)) - NUM_SCALARS - 2
+        num_vectors = len(cls._fields) - NUM_SCALARS - 2
         return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((num_vectors, num_joints)))
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
         """Return the state from the result of `vector`."""
-        values, vectors = np.split(vector[NUM_SCALARS:], [6 * num_joints])
-        return cls(*vector[:NUM_SCALARS].tolist(), *values.reshape(2, -1), *vectors.reshape(-1, num_joints))
+        end = NUM_SCALARS + 6 * num_joints
+        values, vectors = vector[NUM_SCALARS:end].reshape(2, -1), vector[end:].reshape(-1, num_joints)
+        return cls(*vector[:NUM_SCALARS].tolist(), *values, *vectors)
 
     def vector(self) -> np.ndarray:
         """Return the state as one vector, (13 + 26 n,)."""
-        return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
+        return np.concatenate([self[:NUM_SCALARS], *self[NUM_SCALARS:]])
 
     def shifted(self, seconds: float) -> "EstimatorState":
         """Return the state with all local times later, after a jump of the local clock [s]."""
-        names = (
-            "check_time",
-            "receipt_time",
-            "fault_time",
-            "doubt_time",
-            "source_time",
-            "last_offset",
-            "accepted_offset",
-        )
-        return replace(self, **{name: getattr(self, name) + seconds for name in names})
+        times = ("check_time", "receipt_time", "fault_time", "doubt_time", "source_time")
+        names = (*times, "last_offset", "accepted_offset")
+        return self._replace(**{name: getattr(self, name) + seconds for name in names})
 
     def reported_speed(self, period: float) -> float:
         """Return the largest joint speed of the last readable status [rad/s]; NaN without one in three periods [s]."""
@@ -210,7 +204,7 @@ class StateEstimator:
         period: Period of the check [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If a torque tolerance is out of range, or missing.
     """
 
     def __init__(self, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float):
@@ -220,8 +214,6 @@ class StateEstimator:
             raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
         if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
             raise InputError("the torque tolerances of a robot must be positive and finite")
-        if not 0.0 < period < np.inf:
-            raise InputError(f"the period of an estimator must be positive, not {period} s")
         self._zeros, self._velocity_noise = np.zeros(n), np.full(n, limits.velocity_noise)
         self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
 
@@ -252,7 +244,7 @@ class StateEstimator:
         if status is None or fault in DROPPED_FAULTS:
             return self._finish(state, before, fault, now)
         values = status.values()
-        state = replace(state, conflicts=float(status.conflicts), foreign_commands=float(status.foreign_commands))
+        state = state._replace(conflicts=float(status.conflicts), foreign_commands=float(status.foreign_commands))
         is_reordered = status.time <= last.time and fault in ACCEPTABLE_FAULTS
         if is_reordered or (status.time == last.time and np.array_equal(values, last.values)):
             return self._finish(state, before, fault, now)
@@ -264,7 +256,7 @@ class StateEstimator:
         if fault == Fault.CONFLICT and not is_doubted and not is_held:
             # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
-            state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
+            state = state._replace(velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
         is_comparable = 0.0 < elapsed <= self._limits.max_age and fault in ACCEPTABLE_FAULTS
         if (is_doubted and is_trusted) or not is_comparable:
@@ -277,7 +269,7 @@ class StateEstimator:
             # The momentum sums start again at this status.
             is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
-        state = replace(state, pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
+        state = state._replace(pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
         deviation, explained, allowed = self._momentum_deviation(state, M)
         is_contradictory = (deviation > allowed).any()
         if is_held:
@@ -288,9 +280,9 @@ class StateEstimator:
         if not fault:
             fault = self._find_contradiction(state, bool(is_contradictory and not is_explained))
             if fault == Fault.NOT_REACTING:  # another robot does not react to the torques, either
-                state = replace(state, source_time=now)
+                state = state._replace(source_time=now)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
-        state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
+        state = state._replace(last_time=status.time, last_values=values, receipt_time=now)
         velocity = values[self._velocities]
         if is_comparable:
             others, margin = (change[self._positions] / elapsed, state.velocity), self._limits.velocity_noise
@@ -309,22 +301,22 @@ class StateEstimator:
             is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
             if is_explained or not is_held:
                 missing, is_missing = self._missing_velocity(state, M)
-                state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
+                state = state._replace(velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
         if fault not in ACCEPTABLE_FAULTS or not is_trusted:
             return self._finish(state, before, fault, now)
         age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
         reach = EXTERNAL_STEP * self._torque_tolerance
         external = np.clip(values[self._torques], before.external - reach, before.external + reach)
-        state = replace(state, variation=np.abs(external - before.external), external=external)
+        state = state._replace(variation=np.abs(external - before.external), external=external)
         if not is_explained:
             # A collision, or another robot: the external torque decides within `REACTION_WINDOW`.
             missing, is_missing = self._missing_velocity(state, M)
             is_missing &= np.abs(velocity - state.velocity) > AGREEMENT
             if not is_held:
-                state = replace(state, velocity=np.where(is_missing, status.velocities + missing, velocity))
+                state = state._replace(velocity=np.where(is_missing, status.velocities + missing, velocity))
             return self._finish(state, before, fault, now)
-        state = replace(state, velocity=velocity, accepted_values=values)
-        state = replace(state, accepted_time=status.time, accepted_offset=state.last_offset)
+        state = state._replace(velocity=velocity, accepted_values=values)
+        state = state._replace(accepted_time=status.time, accepted_offset=state.last_offset)
         return self._finish(state, before, fault, now, age)
 
     def advance(self, estimate: Estimate, torque: np.ndarray) -> EstimatorState:
@@ -334,7 +326,7 @@ class StateEstimator:
         """
         state = estimate.state
         torque = np.where(np.isfinite(torque), torque, 0.0)
-        return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))
+        return state._replace(torque=torque, variation=state.variation + np.abs(torque - state.torque))
 
     def forget_torque(self, state: EstimatorState) -> EstimatorState:
         """Return the state after a command that was not sent, so that the torques in effect are unknown.
@@ -342,7 +334,7 @@ class StateEstimator:
         Until the next status, the prediction assumes zero torque. The velocity is not compared with torques, and no
         bias is learned.
         """
-        return replace(state, torque=self._zeros, tolerance=self._period * self._torque_tolerance)
+        return state._replace(torque=self._zeros, tolerance=self._period * self._torque_tolerance)
 
     def _clock_jump(self, before: EstimatorState, status: JointStatus | None, now: float) -> float:
         """Return the time [s] by which the local clock has jumped ahead of the robot's since the last check, or 0.
@@ -367,8 +359,7 @@ class StateEstimator:
         external = freshness * before.external
         net = before.torque + external - drag + before.bias
         error = self._torque_tolerance + MODEL_ERROR * np.abs(net) + SENSOR_ERROR * np.abs(external)
-        return replace(
-            before,
+        return before._replace(
             velocity=before.velocity + step * np.linalg.solve(M, net),
             predicted=before.predicted + step * net,
             commanded=before.commanded + step * (net - external),
@@ -406,9 +397,9 @@ class StateEstimator:
         distance = np.abs(values[self._positions] - state.accepted_values[self._positions]).max()
         is_elsewhere = np.isfinite(state.accepted_time) and distance > SOURCE_DISTANCE
         if is_other or (not is_trusted and (is_moving or is_elsewhere)):
-            state = replace(state, source_time=now)
+            state = state._replace(source_time=now)
         if now - state.source_time > SOURCE_TIME:
-            return replace(state, source_time=np.nan), fault
+            return state._replace(source_time=np.nan), fault
         return state, fault if fault or is_trusted else Fault(int(state.fault)) or Fault.CONFLICT
 
     def _agrees(self, status: JointStatus, state: EstimatorState, now: float) -> bool:
@@ -438,8 +429,7 @@ class StateEstimator:
         equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
         deviation = self._deviation(values, change, elapsed)
-        return replace(
-            state,
+        return state._replace(
             residual=np.exp(-elapsed / POSITION_WINDOW) * state.residual + deviation,
             drift=np.exp(-elapsed / DRIFT_WINDOW) * state.drift + deviation,
             equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
@@ -450,7 +440,7 @@ class StateEstimator:
     def _restart(self, state: EstimatorState) -> EstimatorState:
         """Return the state with the comparisons of consecutive statuses reset."""
         zero = self._zeros
-        return replace(state, residual=zero, drift=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
+        return state._replace(residual=zero, drift=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
 
     def _update_momentum(
         self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
@@ -460,8 +450,7 @@ class StateEstimator:
         largest = np.maximum(np.abs(state.pulse), np.exp(-elapsed / PULSE_WINDOW) * state.largest_pulse)
         allowed = (1.0 + MAX_SCALE_ERROR) * largest + state.pulse_error + np.abs(M) @ self._velocity_noise
         is_excessive = np.abs(M @ change - state.other_pulse) > allowed
-        return replace(
-            state,
+        return state._replace(
             predicted=predicted,
             commanded=decay * state.commanded,
             measured=measured,
@@ -476,8 +465,8 @@ class StateEstimator:
         """Return the state with zero momentum sums; the bias is learned from `predicted` minus `change` (n,) [Nms]."""
         bias = self._limited_bias(state.bias - (state.predicted - change) / REST_BIAS_TIME)
         zero = self._zeros
-        state = replace(state, bias=bias, predicted=zero, commanded=zero, measured=zero)
-        return replace(state, reaction=zero, tolerance=zero, excess=zero)
+        state = state._replace(bias=bias, predicted=zero, commanded=zero, measured=zero)
+        return state._replace(reaction=zero, tolerance=zero, excess=zero)
 
     def _limited_bias(self, bias: np.ndarray) -> np.ndarray:
         limit = MAX_BIAS * self._torque_tolerance
@@ -525,13 +514,13 @@ class StateEstimator:
         is_synchronized = fault in ACCEPTABLE_FAULTS and np.isfinite(state.last_time)
         is_late = fault == Fault.STALE and receipt_age <= self._limits.max_age
         if not (is_synchronized or is_late):
-            return replace(state, last_offset=measured, early=0.0), fault
+            return state._replace(last_offset=measured, early=0.0), fault
         delay = measured - offset
         change = min(delay, self._limits.clock_drift * self._period) if delay > 0.0 else EARLY_FRACTION * delay
         early = state.early * np.exp(-receipt_age / EARLY_WINDOW) - min(change, 0.0)
         if early > MAX_EARLY * self._limits.max_lead:
-            return replace(state, last_offset=measured, early=0.0), fault or Fault.CLOCK_RATE
-        return replace(state, last_offset=offset + change, early=early), fault
+            return state._replace(last_offset=measured, early=0.0), fault or Fault.CLOCK_RATE
+        return state._replace(last_offset=offset + change, early=early), fault
 
     def _finish(
         self, state: EstimatorState, before: EstimatorState, fault: Fault, now: float, age: float | None = None
@@ -544,16 +533,16 @@ class StateEstimator:
         # If the robot's clock is set back after a timeout, its controller has restarted.
         has_restarted = fault == Fault.OUT_OF_ORDER and before.fault == Fault.STALE
         if age > MAX_PREDICTION_TIME or has_restarted or not np.isfinite(state.velocity).all():
-            state = replace(state, velocity=self._zeros)
+            state = state._replace(velocity=self._zeros)
         # Computed and not read from a context, so that the state can be copied to a diagram with another time.
         check_time = now + self._period
-        state = replace(state, check_time=check_time)
+        state = state._replace(check_time=check_time)
         if fault:
-            state = replace(state, fault=float(fault), fault_time=now)
+            state = state._replace(fault=float(fault), fault_time=now)
         elif check_time - state.fault_time > self._limits.settling_time and not np.isfinite(state.source_time):
-            state = replace(state, fault=float(Fault.NONE))
+            state = state._replace(fault=float(Fault.NONE))
         if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
-            state = replace(state, doubt_time=now)
+            state = state._replace(doubt_time=now)
         elif check_time - state.doubt_time > self._limits.settling_time:
-            state = replace(state, doubt_time=np.nan)
+            state = state._replace(doubt_time=np.nan)
         return Estimate(fault or Fault(int(before.fault)), age, is_new, state)

@@ -58,7 +58,7 @@ from guiderail_hardware.robot.preflight import (
 )
 from guiderail_hardware.robot.records import check_room, write_record
 from guiderail_hardware.station import HardwareStation
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import STOPPED, ArmState
 
 # Recorded signals of a control step and their sizes.
 SIGNALS = {
@@ -199,7 +199,7 @@ class SkillExecutor:
         context = station.GetMyContextFromRoot(root_context)
         arm_state, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("arm_state", "fault"))
         force, limit = float(station.get_impedance_force_output_port().Eval(context)[0]), self._task.collision.above
-        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+        if arm_state in STOPPED:
             return Outcome(Fault(fault), describe_stop(Fault(fault), station.driver), 0)
         if self._is_stop_requested():
             return Outcome(Fault.USER_STOP, Fault.USER_STOP.description, 0)

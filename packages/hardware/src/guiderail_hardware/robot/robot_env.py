@@ -34,7 +34,7 @@ from guiderail_hardware.robot.preflight import (
     slow_approach,
 )
 from guiderail_hardware.station import HardwareStation
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import STOPPED, ArmState
 
 MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece resists a push [N]
 HOLD_STEPS = 25  # control steps of a push
@@ -252,7 +252,7 @@ class RobotEnv(DiagramEnv):
             RobotStoppedError: If the arm is being stopped.
         """
         self._advance_statuses(self._steps)
-        if self._arm_state in (ArmState.DAMPING, ArmState.OFF):
+        if self._arm_state in STOPPED:
             raise RobotStoppedError(self._active_fault)
         if self._keys.is_stop_requested():
             self._station.stop(self._root_context)

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.systems.support.declarations import check_period, input_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
-from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from guiderail_hardware.systems.torque_safety_limiter import CONTROLLED, ArmState
 
 
 class PosePublisher(LeafSystem):
@@ -56,7 +56,7 @@ class PosePublisher(LeafSystem):
     def _publish(self, context: Context) -> None:
         state = self._arm_state_port.Eval(context)[0]
         pose = self._pose_port.Eval(context)
-        if state in (ArmState.RAMPING, ArmState.RUNNING) and np.isfinite(pose).all():
+        if state in CONTROLLED and np.isfinite(pose).all():
             self._write_pose(self._X_BaseTarget @ pose_to_transform(pose), context.get_time())
         elif state != ArmState.WAITING:
             self._stop()

@@ -32,6 +32,10 @@ class ArmState(IntEnum):
     OFF = 4
 
 
+CONTROLLED = ArmState.RAMPING, ArmState.RUNNING  # states in which the arm follows commanded torques
+STOPPED = ArmState.DAMPING, ArmState.OFF
+
+
 @dataclass(frozen=True)
 class SafetyLimits:
     """Limits of an arm, and durations of its stop and its start.
@@ -214,19 +218,19 @@ class TorqueSafetyLimiter(LeafSystem):
         if arm_state == ArmState.WAITING:
             # Nothing to damp: no velocity has been accepted and no torque has been sent.
             context.SetDiscreteState(self._state, [ArmState.OFF, fault, np.inf, 0.0, 0.0, 0.0])
-        elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+        elif arm_state in CONTROLLED:
             context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0, self._speed(context), 0.0])
 
     def damp_again(self, context: Context) -> None:
         """Restart the damping of a stopped arm, after commands could not be sent; `context` is this system's."""
         arm_state, fault, *_, is_refused = self._state_of(context)
-        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+        if arm_state in STOPPED:
             context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0, self._speed(context), is_refused])
 
     def refuse_hold(self, context: Context) -> None:
         """Damp a stopped arm by torques, because the driver refuses to hold it; `context` is this system's."""
         arm_state, fault, state_time, *rest, _ = self._state_of(context)
-        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+        if arm_state in STOPPED:
             context.SetDiscreteState(self._state, [arm_state, fault, state_time, *rest, 1.0])
 
     def resume(self, context: Context) -> None:
@@ -266,7 +270,7 @@ class TorqueSafetyLimiter(LeafSystem):
         if not (np.abs(joint_state[n:]) <= limits.velocity).all():
             return Fault.VELOCITY_LIMIT
         positions = [self._pose_port.Eval(context)[:3]]
-        if self._state_of(context)[_ARM_STATE] in (ArmState.RAMPING, ArmState.RUNNING):
+        if self._state_of(context)[_ARM_STATE] in CONTROLLED:
             positions.append(self._desired_pose_port.Eval(context)[:3])
         for position in positions:
             if not ((position >= limits.lower) & (position <= limits.upper)).all():
@@ -280,7 +284,7 @@ class TorqueSafetyLimiter(LeafSystem):
         return Fault.NONE
 
     def _stop_at_initialization(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._state_of(context)[_ARM_STATE] in (ArmState.RAMPING, ArmState.RUNNING):
+        if self._state_of(context)[_ARM_STATE] in CONTROLLED:
             speed = self._speed(context)
             discrete_state.set_value(self._state, [ArmState.DAMPING, Fault.INITIALIZED, 0.0, 0.0, speed, 0.0])
 
@@ -291,7 +295,7 @@ class TorqueSafetyLimiter(LeafSystem):
         if arm_state == ArmState.WAITING:
             if not present_fault:
                 arm_state = ArmState.RAMPING
-        elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+        elif arm_state in CONTROLLED:
             if present_fault:
                 arm_state, fault, state_time, blend_factor = ArmState.DAMPING, present_fault, 0.0, 0.0
                 speed, is_refused = self._speed(context), 0.0
@@ -313,7 +317,7 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def _safe_torque(self, context: Context) -> np.ndarray:
         arm_state, _, _, blend_factor, *_ = self._state_of(context)
-        is_active = arm_state in (ArmState.RAMPING, ArmState.RUNNING)
+        is_active = arm_state in CONTROLLED
         torque = np.zeros(self._num_joints)
         if self._is_holding(context):
             return torque
@@ -343,19 +347,19 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def _fault(self, context: Context) -> float:
         arm_state, fault, *_ = self._state_of(context)
-        is_stopped = arm_state in (ArmState.DAMPING, ArmState.OFF)
+        is_stopped = arm_state in STOPPED
         return float(fault if is_stopped else self._present_fault.Eval(context))
 
     def _is_sending(self, context: Context) -> float:
         arm_state, _, state_time, *_ = self._state_of(context)
-        is_sending = arm_state in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
+        is_sending = arm_state in (*CONTROLLED, ArmState.DAMPING)
         if arm_state == ArmState.OFF:
             is_sending = state_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
         return float(is_sending)
 
     def _is_holding(self, context: Context) -> float:
         arm_state, fault, *_, is_refused = self._state_of(context)
-        if arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+        if arm_state in CONTROLLED:
             fault, is_refused = self._present_fault.Eval(context), False
         return float(self._can_hold and not is_refused and arm_state != ArmState.WAITING and fault in STATUS_FAULTS)
 

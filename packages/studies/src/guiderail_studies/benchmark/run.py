@@ -13,7 +13,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
-from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.metrics import STATISTICS
 from guiderail.tools.tables import read_table
 from guiderail_studies.benchmark.protocol import (
     EVALUATED_FILE,
@@ -42,10 +42,6 @@ class Column:
     compute: Callable[[pd.DataFrame, pd.DataFrame], float]  # function of training and evaluated episodes
 
 
-def _violating(rows: pd.DataFrame, column: str) -> int:
-    return int((~(rows[column] <= TOLERANCE)).sum())  # NaN counts as a violation
-
-
 COLUMNS = (
     Column("success_rate", "", "held-out episodes that succeeded", lambda t, e: float(e["success"].mean())),
     Column("training_episodes", "", "training episodes, with demonstrations", lambda t, e: len(t)),
@@ -60,13 +56,13 @@ COLUMNS = (
         "commanded_violations",
         "episodes",
         "training episodes with a commanded pose outside the constraints",
-        lambda t, e: _violating(t, "max_commanded_violation"),
+        lambda t, e: STATISTICS["violating_episodes"].compute(t),
     ),
     Column(
         "measured_violations",
         "episodes",
         "training episodes with a measured pose outside the constraints",
-        lambda t, e: _violating(t, "max_measured_violation"),
+        lambda t, e: STATISTICS["measured_violating_episodes"].compute(t),
     ),
     Column(
         "transient_force",
