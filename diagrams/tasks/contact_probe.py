@@ -26,6 +26,8 @@ PRESS = 2.7 * MM  # depth of the command below the rim; 4 N at the gantry's stif
 CLEARANCE = 0.5 * MM  # height of the start above the rim [m]
 DOWN, END = 0.6, 1.4  # times at which the workpiece has been pressed on the rim, and at which a motion ends [s]
 FROM = 0.92  # time from which a sliding workpiece is measured [s]
+STROKE = 0.3  # duration of a stroke of a workpiece that does not slide around the rim [s]
+MAX_SPEED_ERROR = 0.15  # largest deviation of the speed of a measured stroke, as a fraction of it
 
 
 @dataclass(frozen=True)
@@ -36,19 +38,33 @@ class RimContact:
     radius: float  # displacement of a workpiece that surely stands on the rim [m]
     friction: float  # friction coefficient of both parts
     turn: float = 0.0  # turn of the workpiece about z [rad]
+    # False if the displaced workpiece surely stands on the rim only along x: it then slides to and fro along y. Around
+    # the axis, a workpiece that is not round drops in or is held by the walls, and its drag is not that of the rim.
+    all_round: bool = True
 
 
 def drag(workcell: Any, contact: RimContact, speed: float, station: str = "gantry", **options: Any) -> float:
-    """Return the ratio of drag to normal force of a workpiece that circles on the rim at a speed [m/s].
+    """Return the ratio of drag to normal force of a workpiece that slides on the rim at a speed [m/s].
 
-    It is the median over the time in contact, and not a number if the workpiece does not touch.
+    It is the median over the time in contact at this speed, and not a number if the workpiece does not touch.
     """
-    angles = speed / contact.radius * np.linspace(0.0, END - DOWN, 81)
-    offsets = contact.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    times = np.linspace(0.0, END - DOWN, 81)
+    if contact.all_round:
+        angles = speed / contact.radius * times
+        offsets = contact.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    else:
+        # From the middle of a stroke, along y.
+        position = 0.5 - np.abs((times / STROKE + 0.5) % 2.0 - 1.0)
+        offsets = np.stack([np.full(len(times), contact.radius), speed * STROKE * position], axis=1)
     recording, _ = press_on_rim(workcell, contact, offsets, station, options)
-    wrench = recording["wrench"][round(FROM / CONTROL_PERIOD) :]
-    wrench = wrench[wrench[:, 2] > MIN_CONTACT_FORCE]
-    ratios = np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]
+    wrench, y = recording["wrench"], recording["pose"][:, 1]
+    measured = wrench[:, 2] > MIN_CONTACT_FORCE
+    if contact.all_round:
+        measured[: round(FROM / CONTROL_PERIOD)] = False
+    else:
+        measured[: round(DOWN / CONTROL_PERIOD)] = False
+        measured &= np.abs(np.abs(np.gradient(y, CONTROL_PERIOD)) / speed - 1.0) <= MAX_SPEED_ERROR
+    ratios = np.linalg.norm(wrench[measured, :2], axis=1) / wrench[measured, 2]
     return float(np.median(ratios)) if len(ratios) else float("nan")
 
 

@@ -1,5 +1,7 @@
 """Probe of the contact on the rim: drag, lever arm and capture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,18 @@ def test_drag_of_the_clamp_is_its_friction_at_20_mm_per_s():
     assert drag(clamp.workcell(), contact, 0.02) == pytest.approx(contact.friction, rel=0.15)
     fine = drag(clamp.workcell(), contact, 0.04, time_step=PLANT_PERIOD / 4)
     assert fine == pytest.approx(contact.friction, rel=0.15)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_drag_to_and_fro_is_that_around_the_rim_of_a_round_workpiece(speed):
+    workcell, contact = CONNECTOR.workcell(), CONNECTOR.rim_contact()
+    around, along = (drag(workcell, c, speed) for c in (contact, replace(contact, all_round=False)))
+    assert along == pytest.approx(around, rel=0.1)
+
+
+def test_workpiece_that_does_not_touch_has_no_drag():
+    contact = replace(CONNECTOR.rim_contact(), height=0.2, all_round=False)
+    assert np.isnan(drag(CONNECTOR.workcell(), contact, SPEEDS[0]))
 
 
 def test_drag_is_infinite_error_without_contact():

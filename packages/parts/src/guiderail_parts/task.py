@@ -520,7 +520,7 @@ RIM_OFFSET = 1.5 * MM  # displacement at which a plug is pressed on the rim [m]
 def rim_contact(file: PartTaskFile) -> RimContact:
     """Return the place on the rim of a task file's socket, with the turn that the plug has during a search."""
     turn = float(file.motion.plan_search()[1][0, 3])  # Rz of the first pose
-    return RimContact(file.motion.first_contact, RIM_OFFSET, file.plug.pieces[0].friction, turn)
+    return RimContact(file.motion.first_contact, RIM_OFFSET, file.plug.pieces[0].friction, turn, all_round=False)
 
 
 def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
