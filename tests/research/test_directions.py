@@ -1,22 +1,36 @@
 """Connector whose policy observes directions of force and torque."""
 
+from importlib import import_module
+
+import gymnasium
 import numpy as np
+import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import BncConnector
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.environments import make_environment
-from research.directions import ConnectorDirections, directions
+
+NAME = "ConnectorDirections"
 
 
-def test_directions_have_length_one_above_the_thresholds():
-    found = directions(np.array([3.0, 0.0, 4.0, 0.0, 1e-3, 0.0]))
+@pytest.fixture(scope="module")
+def study():
+    """Return the study's module, whose task is registered for these tests only."""
+    yield import_module("research.directions")
+    del TASKS._entries[NAME]
+    gymnasium.registry.pop(environment_id(NAME))
+
+
+def test_directions_have_length_one_above_the_thresholds(study):
+    found = study.directions(np.array([3.0, 0.0, 4.0, 0.0, 1e-3, 0.0]))
     np.testing.assert_allclose(found, [0.6, 0.0, 0.8, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(directions(np.array([0.1, 0.0, 0.0, 0.0, 0.0, -2.0])), [0, 0, 0, 0, 0, -1])
+    np.testing.assert_allclose(study.directions(np.array([0.1, 0.0, 0.0, 0.0, 0.0, -2.0])), [0, 0, 0, 0, 0, -1])
 
 
-def test_only_the_wrench_of_the_observation_differs():
-    ours, theirs = (task().observe().terms for task in (ConnectorDirections, BncConnector))
+def test_only_the_wrench_of_the_observation_differs(study):
+    ours, theirs = (task().observe().terms for task in (study.ConnectorDirections, BncConnector))
     differing = [(a.signal, b.signal) for a, b in zip(ours, theirs, strict=True) if a.signal != b.signal]
     assert differing == [("wrench_directions", "wrench")]
-    with make_environment("ConnectorDirections", {"difficulty": "hard", "guidance": "kgrl"}) as env:
+    with make_environment(NAME, {"difficulty": "hard", "guidance": "kgrl"}) as env:
         observation, _ = env.reset(seed=0)
         assert env.observation_space.contains(observation)
