@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> None:
     args = parser.parse_args(arguments)
     rows, predictions = [], []
     for run in args.runs:
-        subject, out = find_run(run, None, args.out.resolve() / "rows" / run.resolve().name, "", trust_policy=False)
+        subject, out = find_run(run, None, args.out.resolve() / "rows" / run.resolve().name, "")
         config = subject.config
         assert config is not None  # a run has one
         possible = passport_conditions(

@@ -83,6 +83,15 @@ def test_converge_evaluates_each_step_once(tmp_path, capsys, monkeypatch):
     assert "1/1" not in capsys.readouterr().err.replace("policy 1/1", "")
 
 
+def test_policy_without_a_run_acts_in_the_task(tmp_path, monkeypatch):
+    monkeypatch.setattr(converge_module, "_measure_contact", lambda *_: {})
+    environment = {"difficulty": "hard", "guidance": "kgrl", "bounded_force": False, "force_limit": 5.0}
+    options = {"steps": (5.0,), "episodes": 1, "out": tmp_path, "environment": environment, "processes": 1}
+    assert converge("scripted", task="BncConnector", **options)["rows"][0]["episodes"] == 1
+    with pytest.raises(InputError, match="give --out"):
+        converge("scripted", task="BncConnector")
+
+
 def test_converge_needs_a_folder_for_a_pretrained_policy():
     with pytest.raises(InputError, match="give --out"):
         converge("pretrained:connector")

@@ -129,7 +129,7 @@ def calibrate(
     draws = as_whole(draws, "the number of draws of the prior", MIN_DRAWS)
     predicted = as_whole(predicted, "the number of draws of a prediction", 0)
     processes = check_processes(processes)
-    subject, out = find_run(run, environment, out, "calibration", trust_policy=False)
+    subject, out = find_run(run, environment, out, "calibration")
     config = subject.config
     assert config is not None  # a run has one
     base = subject.changed_environment(dict(environment or {}))

@@ -133,7 +133,11 @@ def robustness(
 
 @cli.command("converge runs/connector --steps 10,5,2.5,1.25 --engines drake,mujoco")
 def converge(
-    run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
+    run: Annotated[
+        str,
+        argument("Folder of a run. With --out also pretrained:NAME ({pretrained}), or any policy with --task.", "RUN"),
+    ],
+    task: cli.PolicyTask = None,
     steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
     engines: Annotated[str, option("Engines: drake, mujoco, pybullet and sapien, comma-separated.")] = "drake",
     episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
@@ -142,6 +146,7 @@ def converge(
     out: Annotated[Path | None, option("Folder to write.  [default: converge in the run]")] = None,
     processes: cli.Processes = None,
     trust_policy: cli.TrustPolicy = False,
+    imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
@@ -157,6 +162,7 @@ def converge(
 
     result = evaluate_convergence(
         run,
+        task=None if task is None else cli.find_task(task, imports)[0],
         steps=parse_steps(steps),
         engines=engines,
         episodes=episodes,
@@ -179,7 +185,11 @@ def converge(
 
 @cli.command("passport runs/connector")
 def passport(
-    run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
+    run: Annotated[
+        str,
+        argument("Folder of a run. With --out also pretrained:NAME ({pretrained}), or any policy with --task.", "RUN"),
+    ],
+    task: cli.PolicyTask = None,
     engines: Annotated[
         str | None,
         option("Engines: drake, mujoco, pybullet and sapien, comma-separated.  [default: those that are installed]"),
@@ -190,6 +200,7 @@ def passport(
     out: Annotated[Path | None, option("Folder to write.  [default: passport in the run]")] = None,
     processes: cli.Processes = None,
     trust_policy: cli.TrustPolicy = False,
+    imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
 ) -> None:
@@ -203,6 +214,7 @@ def passport(
 
     result = evaluate_passport(
         run,
+        task=None if task is None else cli.find_task(task, imports)[0],
         engines=engines,
         episodes=episodes,
         seed=seed,

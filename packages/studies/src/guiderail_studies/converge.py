@@ -119,6 +119,7 @@ def conditions(task: str, environment: Mapping[str, Any], steps: Sequence[float]
 def converge(
     policy: Path | str,
     *,
+    task: str | None = None,
     steps: Sequence[float] = STEPS,
     engines: str = "drake",
     episodes: int = EPISODES,
@@ -133,7 +134,8 @@ def converge(
     The episodes are stored in `out`, so that the same call resumes an interrupted evaluation.
 
     Args:
-        policy: Run, or `pretrained:NAME`.
+        policy: Run, or `pretrained:NAME`; with `task`, any policy that `find_subject` takes.
+        task: Task of a policy without a run.
         steps: Plant steps in Drake [ms].
         engines: "drake", "mujoco", "pybullet" and "sapien", comma-separated.
         episodes: Number of held-out episodes of each condition, with the same seeds.
@@ -150,7 +152,7 @@ def converge(
     Raises:
         InputError: If there is no trained run, or an argument is invalid or missing.
     """
-    subject, out = find_run(policy, environment, out, "converge", trust_policy=trust_policy)
+    subject, out = find_run(policy, environment, out, "converge", task=task, trust_policy=trust_policy)
     config = subject.config
     assert config is not None  # a run has one
     found = conditions(config.task, subject.changed_environment(dict(environment or {})), steps, engines)
@@ -180,14 +182,20 @@ def converge(
 
 
 def find_run(
-    policy: Path | str, environment: Mapping[str, Any] | None, out: Path | None, name: str, *, trust_policy: bool
+    policy: Path | str,
+    environment: Mapping[str, Any] | None,
+    out: Path | None,
+    name: str,
+    *,
+    task: str | None = None,
+    trust_policy: bool = False,
 ) -> tuple[Subject, Path]:
-    """Return a run's policy, and the folder to write, by default `name` in the run.
+    """Return the policy of a run or one that acts in a task, and the folder to write, by default `name` in the run.
 
     Raises:
         InputError: If there is no trained run, or a policy without a folder has no `out`.
     """
-    subject = find_subject(policy, None, environment, trust_policy=trust_policy)
+    subject = find_subject(policy, task, environment, trust_policy=trust_policy)
     if out is None:
         if subject.folder is None or not subject.is_stored:
             raise InputError("a policy without a folder needs one for the results: give --out")

@@ -79,6 +79,7 @@ def passport_conditions(
 def passport(
     policy: Path | str,
     *,
+    task: str | None = None,
     engines: str | None = None,
     episodes: int = EPISODES,
     seed: int = HELD_OUT_SEED,
@@ -93,7 +94,8 @@ def passport(
     The episodes are stored in `out`, so that the same call resumes an interrupted evaluation.
 
     Args:
-        policy: Run, or `pretrained:NAME`.
+        policy: Run, or `pretrained:NAME`; with `task`, any policy that `find_subject` takes.
+        task: Task of a policy without a run.
         engines: "drake", "mujoco", "pybullet" and "sapien", comma-separated; None for those that are installed.
         episodes: Number of held-out episodes of each condition, with the same seeds.
         seed: Seed of the first episode.
@@ -110,7 +112,7 @@ def passport(
     Raises:
         InputError: If there is no trained run, or an argument is invalid or missing.
     """
-    subject, out = find_run(policy, environment, out, "passport", trust_policy=trust_policy)
+    subject, out = find_run(policy, environment, out, "passport", task=task, trust_policy=trust_policy)
     config = subject.config
     assert config is not None  # a run has one
     options = subject.changed_environment(dict(environment or {}))
