@@ -7,7 +7,8 @@ alone), policies of single training parts, specialists of the held-out parts, th
 mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, and in
 MuJoCo. `--few-shot` compares specialists that learn from scratch with those that the general policy demonstrates to,
 and evaluates the former on the other parts. Every finished step is stored, and the same command resumes. `rows/` has
-the episodes of each policy on each part, `table.md` the successes.
+the episodes of each policy on each part, `table.md` the successes, `contact.csv` the drag of each held-out part on its
+rim.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from typing import Any
 import pandas as pd
 from scipy.stats import wilcoxon
 
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.tasks.contact_probe import SPEEDS, drag
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
 from guiderail.tools.files import write_atomically
@@ -81,6 +84,16 @@ def prepare(
 def prepared(folder: Path, names: Sequence[str], number: int) -> list[Path]:
     """Return the first `number` task folders that exist, in the order of `names`."""
     return [folder / name for name in names if (folder / name / "task.yaml").is_file()][:number]
+
+
+def measure_drags(parts: Sequence[Path], file: Path) -> None:
+    """Write a table of the ratio of drag to normal force of each part on its rim; empty if it does not stand there."""
+    rows = []
+    for part in parts:
+        task = EnvConfig.resolve(task_named(str(part))[0], ENVIRONMENT).declared
+        ratios = [drag(task.workcell(), task.rim_contact(), speed) for speed in SPEEDS]
+        rows.append({"part": part.name, **{f"drag_{1e3 * v:g}": r for v, r in zip(SPEEDS, ratios, strict=True)}})
+    write_table(file.with_suffix(""), rows)
 
 
 def train_once(
@@ -219,6 +232,8 @@ def main(arguments: list[str]) -> None:
     )
     used = {"training": [part.name for part in training], "held_out": [part.name for part in held_out]}
     write_atomically(out / "parts.json", json.dumps(used, indent=1).encode())
+    if not (out / "contact.csv").exists():
+        measure_drags(held_out, out / "contact.csv")
     runs = [train_once(training, out / "runs" / f"general-{seed}", seed, args.episodes) for seed in range(args.seeds)]
     policies: dict[str, Path | str] = {name: name for name in ("zero", "uniform_random", "scripted")}
     policies |= {run.name: run for run in runs}

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("guiderail_parts")
 
 from guiderail.models.common.errors import InputError
-from research.unseen_parts import compare_single_parts, main, prepared, split_parts, tabulate
+from research.unseen_parts import compare_single_parts, main, measure_drags, prepared, split_parts, tabulate
 
 
 def test_split_depends_on_the_names_alone():
@@ -41,6 +41,15 @@ def test_easy_parts_are_reported_apart(tmp_path):
     assert summary["general-0"]["mean"] == 0.75
     assert summary["general-0"]["mean_where_learning_shows"] == 1.0
     assert (summary["general-0"]["collisions"], summary["general-0"]["peak_force"]) == (2, 4.0)
+
+
+def test_drag_is_measured_at_both_speeds(tmp_path, monkeypatch):
+    monkeypatch.setattr("research.unseen_parts.task_named", lambda folder: ("BncConnector", ()))
+    monkeypatch.setattr("research.unseen_parts.ENVIRONMENT", {"guidance": "kgrl", "difficulty": "hard"})
+    monkeypatch.setattr("research.unseen_parts.drag", lambda workcell, contact, speed: 0.2 + speed)
+    measure_drags([tmp_path / "peg"], tmp_path / "contact.csv")
+    (row,) = pd.read_csv(tmp_path / "contact.csv").to_dict("records")
+    assert row == {"part": "peg", "drag_20": pytest.approx(0.22), "drag_40": pytest.approx(0.24)}
 
 
 def test_best_single_part_policy_is_chosen_without_its_own_part(tmp_path, monkeypatch):
