@@ -46,24 +46,23 @@ class RimContact:
 def drag(workcell: Any, contact: RimContact, speed: float, station: str = "gantry", **options: Any) -> float:
     """Return the ratio of drag to normal force of a workpiece that slides on the rim at a speed [m/s].
 
-    It is the median over the time in contact at this speed, and not a number if the workpiece does not touch.
+    It is the median over the time in contact, and not a number if the workpiece does not touch. To and fro, only the
+    time at this speed counts; around the axis, the workpiece lags behind the command and is slower.
     """
     times = np.linspace(0.0, END - DOWN, 81)
     if contact.all_round:
-        angles = speed / contact.radius * times
+        begin, angles = FROM, speed / contact.radius * times
         offsets = contact.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     else:
         # From the middle of a stroke, along y.
+        begin = DOWN
         position = 0.5 - np.abs((times / STROKE + 0.5) % 2.0 - 1.0)
         offsets = np.stack([np.full(len(times), contact.radius), speed * STROKE * position], axis=1)
     recording, _ = press_on_rim(workcell, contact, offsets, station, options)
-    wrench, y = recording["wrench"], recording["pose"][:, 1]
+    wrench, pose = (recording[name][round(begin / CONTROL_PERIOD) :] for name in ("wrench", "pose"))
     measured = wrench[:, 2] > MIN_CONTACT_FORCE
-    if contact.all_round:
-        measured[: round(FROM / CONTROL_PERIOD)] = False
-    else:
-        measured[: round(DOWN / CONTROL_PERIOD)] = False
-        measured &= np.abs(np.abs(np.gradient(y, CONTROL_PERIOD)) / speed - 1.0) <= MAX_SPEED_ERROR
+    if not contact.all_round:
+        measured &= np.abs(np.abs(np.gradient(pose[:, 1], CONTROL_PERIOD)) / speed - 1.0) <= MAX_SPEED_ERROR
     ratios = np.linalg.norm(wrench[measured, :2], axis=1) / wrench[measured, 2]
     return float(np.median(ratios)) if len(ratios) else float("nan")
 
