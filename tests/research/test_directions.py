@@ -2,23 +2,19 @@
 
 from importlib import import_module
 
-import gymnasium
 import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector import BncConnector
-from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.environments import make_environment
 
 NAME = "ConnectorDirections"
 
 
 @pytest.fixture(scope="module")
-def study():
-    """Return the study's module, whose task is registered for these tests only."""
-    yield import_module("research.directions")
-    del TASKS._entries[NAME]
-    gymnasium.registry.pop(environment_id(NAME))
+def study(own_tasks):
+    """Return the study's module."""
+    return import_module("research.directions")
 
 
 def test_directions_have_length_one_above_the_thresholds(study):

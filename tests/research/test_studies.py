@@ -8,6 +8,8 @@ from guiderail_studies.declaration import load_study
 from guiderail_studies.job import Job, check_job
 from research.studies import study_names, study_path
 
+pytestmark = pytest.mark.usefixtures("own_tasks")
+
 
 @pytest.mark.parametrize("name", study_names())
 def test_study_of_research_is_valid(name, tmp_path):
