@@ -327,7 +327,8 @@ class GridClamp(InsertionTask):
 
     def rim_contact(self) -> RimContact:
         """Return the place at which the pegs stand on the faces around their holes."""
-        return RimContact(self.workcell().dimensions.peg_length, 2.5 * MM, self.friction)
+        # At 2.5 mm a clamp that lags behind 40 mm/s circles at 0.6 mm, and drags its pegs in the chamfers.
+        return RimContact(self.workcell().dimensions.peg_length, 3.5 * MM, self.friction)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D (6, 6) and y0 (6,) of an estimate of the height; a pull checks the lateral offset instead."""
