@@ -4,9 +4,10 @@ The parts are split by a rule before anything is trained (`split_parts`), and th
 Then the parts are prepared, a policy is trained over the training parts with each seed, and all policies are evaluated
 on the held-out parts: uniform random actions, the scripted search (with the contact map, and by the center of pressure
 alone), policies of single training parts, specialists of the held-out parts, the general policy of each seed, and the
-mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, and in
-MuJoCo. `--few-shot` compares specialists that learn from scratch with those that the general policy demonstrates to,
-and evaluates the former on the other parts. Every finished step is stored, and the same command resumes. `rows/` has
+mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, in MuJoCo,
+and on the first `--few-shot` parts with a half and a quarter of the plant's step. On the same parts, specialists that
+learn from scratch are compared with those that the general policy demonstrates to, and the former are evaluated on the
+other parts. Every finished step is stored, and the same command resumes. `rows/` has
 the episodes of each policy on each part, `table.md` the successes, `contact.csv` the drag of each held-out part on its
 rim.
 """
@@ -23,6 +24,7 @@ import pandas as pd
 from scipy.stats import wilcoxon
 
 from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.diagrams.tasks.contact_probe import SPEEDS, drag
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
@@ -43,6 +45,8 @@ CONDITIONS = {
     "hard": ENVIRONMENT,
     "automate": ENVIRONMENT | {"difficulty": "automate"},
     "mujoco": ENVIRONMENT | {"station": "mujoco"},
+    "half_step": ENVIRONMENT | {"time_step": PLANT_PERIOD / 2},
+    "quarter_step": ENVIRONMENT | {"time_step": PLANT_PERIOD / 4},
     "center_of_pressure": ENVIRONMENT | {"observation": "center_of_pressure"},  # for a search without a contact map
 }
 FEW_SHOT = (10, 20, 40, 80)  # training episodes after which a specialist is evaluated
@@ -206,7 +210,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--specialists", type=int, default=150, help="training episodes of each held-out part's specialist; 0: none"
     )
-    parser.add_argument("--few-shot", type=int, default=10, help="held-out parts on which specialists are compared")
+    parser.add_argument("--few-shot", type=int, default=10, help="held-out parts for specialists and steps (default: 10)")
     parser.add_argument("--evaluated", type=int, default=100, help="held-out episodes of each part (default: 100)")
     parser.add_argument("--processes", type=int, default=1, help="pairs that are prepared at a time (default: 1)")
     parser.add_json()
@@ -250,15 +254,16 @@ def main(arguments: list[str]) -> None:
     general = {name: run for name, run in policies.items() if name.startswith("general-")}
     for part in held_out:
         evaluate_part(part, {"scripted": "scripted"}, args.evaluated, out, "center_of_pressure")
-    for condition in ("automate", "mujoco"):
-        for part in held_out:
+    few = held_out[: args.few_shot]
+    for condition, parts in {"automate": held_out, "mujoco": held_out, "half_step": few, "quarter_step": few}.items():
+        for part in parts:
             evaluate_part(part, general, args.evaluated, out, condition)
     for part in held_out if args.specialists else ():
         run = train_once([part], out / "runs" / f"specialist-{part.name}", 0, args.specialists)
         evaluate_part(part, {"specialist": run}, args.evaluated, out)
-    for part in held_out[: args.few_shot]:
+    for part in few:
         learn_few_shot(part, out / "runs" / "general-mean", 0, args.evaluated, out)
-    compare_single_parts(held_out[: args.few_shot], held_out[args.few_shot :], args.evaluated, out)
+    compare_single_parts(few, held_out[args.few_shot :], args.evaluated, out)
     summary = {}
     for condition in CONDITIONS:
         if (out / "rows" / condition).is_dir():
