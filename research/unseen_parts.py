@@ -210,7 +210,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--specialists", type=int, default=150, help="training episodes of each held-out part's specialist; 0: none"
     )
-    parser.add_argument("--few-shot", type=int, default=10, help="held-out parts for specialists and steps (default: 10)")
+    parser.add_argument(
+        "--few-shot", type=int, default=10, help="held-out parts for specialists and steps (default: 10)"
+    )
     parser.add_argument("--evaluated", type=int, default=100, help="held-out episodes of each part (default: 100)")
     parser.add_argument("--processes", type=int, default=1, help="pairs that are prepared at a time (default: 1)")
     parser.add_json()
