@@ -250,10 +250,16 @@ FRICTION = 0.2  # friction coefficient of metal on metal
 # with a force that depends on the time step. Chamfer and bore therefore touch a barrel without a margin, and the
 # mouth's face, whose normal is the axis, another one.
 MARGIN = 0.1 * MM
-# Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
-# than with metal parts (docs/experiments.md, "Center of pressure on the rim").
-BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM)
-LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
+# With 100 s/m, no part leaves a contact faster than 10 mm/s. With less, a plug that slips off the rim and meets the
+# bore within one time step, without a margin, is ejected: at half the friction with 94 N (docs/experiments.md,
+# "Converged contact of the connector").
+DISSIPATION = 100.0
+# The stiffness with which drag on the rim is the friction at time steps of 2.5 to 10 ms. The end has that of brass: a
+# softer one distributes the load along the rim, and the torque on a misaligned plug is larger than with metal parts
+# (docs/experiments.md, "Center of pressure on the rim").
+BARREL = ContactMaterial(friction=FRICTION, modulus=3e10, resolution=1.5 * MM, dissipation=DISSIPATION)
+BARREL_END = replace(BARREL, modulus=1e11, margin=MARGIN)
+LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, dissipation=DISSIPATION, margin=MARGIN)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # models the gasket as a soft spring
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
@@ -279,18 +285,18 @@ def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     circle.
     """
     d = dimensions
-    barrel_material, lug_material = (replace(metal, friction=friction) for metal in (BARREL, LUG))
+    side, end, lug_material = (replace(metal, friction=friction) for metal in (BARREL, BARREL_END, LUG))
     center = sdf.at(z=d.barrel_height / 2)
     barrel = sdf.cylinder(sdf.equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
     pad = (sdf.at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), sdf.cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = sdf.collision("barrel", center, barrel, barrel_material)
-    contents += sdf.collision("barrel_end", center, barrel, replace(barrel_material, margin=MARGIN))
+    contents = sdf.collision("barrel", center, barrel, side)
+    contents += sdf.collision("barrel_end", center, barrel, end)
     contents += sdf.visual("barrel_visual", center, sdf.cylinder(d.barrel_radius, d.barrel_height), NICKEL)
     contents += sdf.collision("pad", *pad, PAD) + sdf.visual("pad_visual", *pad, RUBBER)
-    for number, side in enumerate((1.0, -1.0)):
-        lug = (sdf.at(x=side * lug_center, z=d.lug_height, pitch=np.pi / 2), sdf.cylinder(d.lug_radius, lug_length))
+    for number, sign in enumerate((1.0, -1.0)):
+        lug = (sdf.at(x=sign * lug_center, z=d.lug_height, pitch=np.pi / 2), sdf.cylinder(d.lug_radius, lug_length))
         contents += sdf.collision(f"lug_{number}", *lug, lug_material) + sdf.visual(f"lug_{number}_visual", *lug, BRASS)
     return sdf.model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 

@@ -5,8 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.guidance.primitive import make_law
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.bnc_connector import (
     ALIGNMENT,
     NUM_STEPS,
@@ -294,3 +297,30 @@ def test_wrist_image_changes_with_the_offset_of_the_jack(station):
         is_changed = np.abs(images["image", offset].astype(int) - image).max(-1) > 30
         assert is_changed.sum() > 20
         np.testing.assert_allclose(images["image_and_state", offset][-13:-6], both[-13:-6], atol=1e-6)
+
+
+@pytest.mark.parametrize("time_step", [0.01, 0.005])
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.1])
+def test_plug_that_meets_the_bore_within_a_step_is_not_ejected(time_step, angle):
+    """It has slipped off the rim, is 0.06 mm in the bore's wall, and becomes no faster."""
+    task = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
+    workcell, direction = task.workcell(), np.array([np.cos(angle), np.sin(angle)])
+    pose = np.array([0.0, 0.0, task.rim_contact().height - 0.22 * MM, np.pi / 2, 0.0, 0.0])
+    pose[:2] = (workcell.dimensions.bore_clearance + 0.06 * MM) * direction
+    station = STATIONS.get("gantry").build(workcell, time_step=time_step)
+    driven = DrivenStation(station, linear_motion(np.array([0.0, 1.0]), np.array([pose, pose])), 6)
+    driven.start(pose + [0.0, 0.0, MM, 0.0, 0.0, 0.0])
+    driven.run(1)  # the command of the first plant step is not this pose yet
+    station.set_pose(driven.context, pose)
+    velocities = np.array([*(18e-3 * direction), -15e-3, 0.0, 0.0, 0.0])
+    station.plant.SetVelocities(driven.plant_context, velocities)
+    speeds = []
+
+    def record(context):
+        found = station.plant.GetVelocities(station.plant.GetMyContextFromRoot(context))
+        speeds.append(np.linalg.norm(found[:3]))
+
+    driven.simulator.set_monitor(record)
+    driven.run()
+    assert len(speeds) > 5 * 0.02 / time_step
+    assert max(speeds) <= np.linalg.norm(velocities)
