@@ -46,8 +46,8 @@ class DrivenStation:
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
         builder.AddNamedSystem("source", source)
-        hold = ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE)
-        desired_pose = add_system(builder, "hold", hold, source.get_output_port(0)).get_output_port()
+        self._hold = ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE)
+        desired_pose = add_system(builder, "hold", self._hold, source.get_output_port(0)).get_output_port()
         builder.Connect(desired_pose, station.get_desired_pose_input_port())
         forces = station.impedance_force()
         recorder = Recorder(SIGNALS | dict.fromkeys(forces, 1), num_samples, CONTROL_PERIOD)
@@ -70,6 +70,8 @@ class DrivenStation:
     def start(self, pose: np.ndarray) -> None:
         """Set the tool center at rest at `pose`, (6,), and initialize the simulator; call this before `run`."""
         self.station.set_pose(self.context, pose)
+        # The first plant step reads the hold before its first sample.
+        self._hold.SetVectorState(self._hold.GetMyMutableContextFromRoot(self.context), pose)
         self.simulator.Initialize()
 
     def run(self, num_steps: int | None = None) -> Recording:

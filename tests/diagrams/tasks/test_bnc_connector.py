@@ -308,10 +308,8 @@ def test_plug_that_meets_the_bore_within_a_step_is_not_ejected(time_step, angle)
     pose = np.array([0.0, 0.0, task.rim_contact().height - 0.22 * MM, np.pi / 2, 0.0, 0.0])
     pose[:2] = (workcell.dimensions.bore_clearance + 0.06 * MM) * direction
     station = STATIONS.get("gantry").build(workcell, time_step=time_step)
-    driven = DrivenStation(station, linear_motion(np.array([0.0, 1.0]), np.array([pose, pose])), 6)
-    driven.start(pose + [0.0, 0.0, MM, 0.0, 0.0, 0.0])
-    driven.run(1)  # the command of the first plant step is not this pose yet
-    station.set_pose(driven.context, pose)
+    driven = DrivenStation(station, linear_motion(np.array([0.0, 1.0]), np.array([pose, pose])), 5)
+    driven.start(pose)
     velocities = np.array([*(18e-3 * direction), -15e-3, 0.0, 0.0, 0.0])
     station.plant.SetVelocities(driven.plant_context, velocities)
     speeds = []
