@@ -3,13 +3,16 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.tables import table_text
 from guiderail_studies.job import Job
 from research.reproduction import runs as module
 from research.reproduction.command import main
 from research.reproduction.runs import FIGURES, find_runs, jobs_of, remaining_hours
+from research.reproduction.tables import _merge
 from research.studies import study_names
 
 CLAMP = FIGURES["3.10"][0]
@@ -56,6 +59,20 @@ def test_command_refuses_runs_that_are_not_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr("research.reproduction.command.num_done", lambda job: 1)
     with pytest.raises(InputError, match="give --resume"):
         main(["--figure", "3.10", "--out", str(tmp_path)])
+
+
+def test_stored_runs_stay_unless_the_folder_has_as_many_episodes(tmp_path):
+    """The runs of figure 4.5 don't remove those of figure 5.6 from their table, nor does an unfinished run."""
+    file = tmp_path / "table.csv"
+
+    def run(method, seed, episodes, value):
+        return pd.DataFrame({"method": method, "seed": seed, "episode": range(episodes), "return": value})
+
+    stored = [run("kgrl", 0, 3, 1.0), run("kgrl", 1, 3, 1.0), run("skgrl", 0, 3, 1.0)]
+    file.write_text(table_text(pd.concat(stored)))
+    merged = _merge(file, [run("kgrl", 0, 2, 2.0), run("kgrl", 1, 3, 2.0), run("residual", 0, 1, 2.0)])
+    means = merged.groupby(["method", "seed"])["return"].mean().to_dict()
+    assert means == {("kgrl", 0): 1.0, ("kgrl", 1): 2.0, ("skgrl", 0): 1.0, ("residual", 0): 2.0}
 
 
 def test_training_ends_after_consecutive_successes(tmp_path, monkeypatch):
