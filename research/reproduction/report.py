@@ -151,7 +151,7 @@ def entries(tables: Path = TABLES) -> list[Entry]:
             "1 of sKGRL (1)",
         ),
         _positions(),
-        _connector_comparison(),
+        _connector_comparison(tables),
         _jerk(tables),
     ]
 
@@ -757,7 +757,15 @@ def _connector() -> Entry:
     )
 
 
-def _connector_comparison() -> Entry:
+def _present_runs(tables: Path) -> dict[str, list[pd.DataFrame]]:
+    """Return the first ten training episodes of the stored runs in the present contact by method."""
+    table = _read(tables, "connector_10hz")
+    if table is None:
+        return {}
+    return {method: [run.head(10) for run in _runs_of(table, method)] for method in ("kgrl", "skgrl")}
+
+
+def _connector_comparison(tables: Path) -> Entry:
     kgrl, skgrl = (_connector_rows(method) for method in ("kgrl", "skgrl"))
     success = [_percent(rows["training_success_rate_last_10"].mean()) for rows in (kgrl, skgrl)]
     column = "training_mean_return_last_10"
@@ -767,10 +775,18 @@ def _connector_comparison() -> Entry:
         ("5.9",),
         f"{PARTLY}: {success[0]} (KGRL) and {success[1]} (sKGRL) of the last ten of 45 episodes succeed; {returns}",
         "success and return of the last ten training episodes",
-        (_connector_sentence("kgrl", "KGRL"), _connector_sentence("skgrl", "sKGRL")),
+        (
+            _connector_sentence("kgrl", "KGRL"),
+            _connector_sentence("skgrl", "sKGRL"),
+            *(
+                f"in the present contact {_percent(pd.concat(runs)['success'].mean())} of the first ten training "
+                f"episodes of {len(runs)} runs of {method} succeed"
+                for method, runs in _present_runs(tables).items()
+            ),
+        ),
         f"{len(skgrl)} (10)",
         AT_10_HZ,
-        ("results/connector_10hz.csv",),
+        ("results/connector_10hz.csv", "reproduction/tables/connector_10hz.csv"),
         CONNECTOR_STUDY,
         float(skgrl["training_wall_time"].sum()) / 3600,
     )
@@ -790,8 +806,7 @@ def _jerk(tables: Path) -> Entry:
     }
     ours = [f"{label}: {earlier[column]:.1f} times" for column, label in columns.items() if column in earlier]
     stored_files: tuple[str, ...] = ("results/connector_10hz.csv",)
-    if (table := _read(tables, "connector_10hz")) is not None:
-        runs = {method: [run.head(10) for run in _runs_of(table, method)] for method in ("kgrl", "skgrl")}
+    if runs := _present_runs(tables):
         means = {method: pd.concat(own)[list(columns)].mean() for method, own in runs.items()}
         ratios = ", ".join(f"{label} {means['kgrl'][c] / means['skgrl'][c]:.1f} times" for c, label in columns.items())
         ours.append(f"in the present contact, {len(runs['skgrl'])} runs: {ratios}")

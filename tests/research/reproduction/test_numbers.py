@@ -21,8 +21,9 @@ JERKS = ("commanded_linear", "commanded_angular", "measured_linear")
 
 @cache
 def table(name):
-    """Return a stored table of the reproduction, or else of the results."""
-    folder = TABLES if (TABLES / f"{name}.csv").is_file() and name != "connector_10hz" else RESULTS
+    """Return a stored table: of the reproduction, a row for each episode, or else of the results."""
+    is_of_runs = name == "connector_10hz" or not (TABLES / f"{name}.csv").is_file()
+    folder = RESULTS if is_of_runs else TABLES
     return pd.read_csv(folder / f"{name}.csv")
 
 
@@ -183,6 +184,22 @@ def test_numbers_of_the_connector():
     assert returns[0] < returns[1]  # sKGRL's return is the higher one after convergence as well
 
 
+def test_demonstration_alone_never_locks_the_connector():
+    slow = rows_of("connector_thesis", "demonstration")
+    at_10_hz = rows_of("connector_10hz_evaluated", "demonstration")
+    assert f"none of {slow['episodes'].sum()} episodes at 50 Hz and {len(at_10_hz)} at 10 Hz" in page()
+    assert slow["success_rate"].sum() + at_10_hz["success"].sum() == 0
+
+
+def test_scripted_policy_locks_the_connector_with_some_histories():
+    rows = table("connector_history")
+    solved = (rows["success_rate"] * rows["episodes"]).groupby(rows["method"]).sum().round().astype(int).to_dict()
+    assert (rows["episodes"].groupby(rows["method"]).sum() == 6).all()
+    assert f"{solved.pop('thesis_50_hz')} of 6 episodes at 50 Hz and in {solved.pop('thesis')} of 6 at 10 Hz" in page()
+    assert set(solved) == {"one_pose_50_hz", "larger_variance", "one_pose", "commanded"}
+    assert set(solved.values()) == {6}
+
+
 def test_numbers_of_the_jerk():
     kgrl, skgrl = (rows_of("connector_10hz", method).set_index("seed") for method in ("kgrl", "skgrl"))
     columns = [f"training_jerk_{jerk}_first_10" for jerk in JERKS]
@@ -192,6 +209,14 @@ def test_numbers_of_the_jerk():
     assert f"| measured pose | {low_measured:.1f} to {high_measured:.1f} | – |" in page()
     means = [kgrl[column].mean() / skgrl[column].mean() for column in columns]
     assert f"{means[1]:.0f} times in rotation, {means[0]:.0f} times in translation" in page()
+    present = pd.read_csv(TABLES / "connector_10hz.csv")
+    means = present[present["episode"] < 10].groupby(["method", "seed"]).mean(numeric_only=True)
+    ratios = means.loc["kgrl"] / means.loc["skgrl"]
+    assert len(ratios) == 3
+    for which, label in (("commanded", "command"), ("measured", "measured pose")):
+        linear, angular = (ratios[f"jerk_{which}_{part}"] for part in ("linear", "angular"))
+        numbers = f"{linear.min():.1f} to {linear.max():.1f} | {angular.min():.0f} to {angular.max():.0f}"
+        assert f"| {label} | {numbers} |" in page()
     free = table("smoothness").query("place == 'free' and method == 'sKGRL P=10 ρ=1e-08'").iloc[0]
     linear, angular = free["times_below_kgrl_linear"], free["times_below_kgrl_angular"]
     assert f"in free space | command | {linear:.1f} | {angular:.0f} |" in page()
