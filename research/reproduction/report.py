@@ -186,7 +186,7 @@ def _positions() -> Entry:
         "5.8",
         "mean over exploring episodes of the largest change of x, y in a control step, and of the jerk",
         "in simulation, on the gantry; the shipped ρ and commanded history",
-        f"{stored['seeds']} seeds of random actions",
+        f"{stored['seeds']} seeds",
     )
     return replace(
         entry, verdict=f"{PARTLY}: jumps of the command are {commanded} smaller, of the measured position {measured}"
@@ -770,7 +770,7 @@ def _connector_comparison(tables: Path) -> Entry:
     success = [_percent(rows["training_success_rate_last_10"].mean()) for rows in (kgrl, skgrl)]
     column = "training_mean_return_last_10"
     is_higher = kgrl[column].mean() > skgrl[column].mean()
-    returns = "KGRL's return is higher" if is_higher else "sKGRL's return is higher in the end, not KGRL's"
+    returns = "KGRL's return is higher" if is_higher else "sKGRL's return is higher, not KGRL's"
     return Entry(
         ("5.9",),
         f"{PARTLY}: {success[0]} (KGRL) and {success[1]} (sKGRL) of the last ten of 45 episodes succeed; {returns}",
@@ -813,7 +813,7 @@ def _jerk(tables: Path) -> Entry:
         stored_files += ("reproduction/tables/connector_10hz.csv",)
     return Entry(
         ("5.10",),
-        f"{PARTLY}: {earlier['jerk_commanded_angular']:.0f} times in rotation, "
+        f"{PARTLY}: {earlier['jerk_commanded_angular']:.0f} times smaller in rotation, "
         f"{earlier['jerk_commanded_linear']:.0f} times in translation",
         "mean jerk of the first ten training episodes, KGRL's divided by sKGRL's",
         tuple(ours),
@@ -856,9 +856,8 @@ def _return_comparison(tables: Path) -> Entry:
         number = sum(float(run["return"].iloc[50:].mean()) > final["kgrl"] for run in runs["skgrl"])
         never = sum(avoided_at(run["reward_obstacle_cost"]) is None for run in runs["skgrl"])
         verdict = (
-            f"{PARTLY}: lower cost of actions and later avoidance; a higher return in {number} of {len(runs['skgrl'])} "
-            f"runs, but not on average: {never} never avoid the obstacle; after constant actions a higher return, but "
-            "no later avoidance"
+            f"{PARTLY}: lower cost of actions and later avoidance; higher return in {number} of {len(runs['skgrl'])} "
+            f"runs, {never} never avoid the obstacle; after constant actions a higher return, but no later avoidance"
         )
     return Entry(
         ("5.6",),
