@@ -665,7 +665,7 @@ def _images(tables: Path) -> Entry:
 
 
 EARLIER_CONTACT = (
-    "in an earlier contact at 10 ms, which brakes a plug that slides over the rim and makes the task easier "
+    "in an earlier contact at a plant step of 10 ms, which had not converged "
     "([converged contact](../../docs/experiments.md#converged-contact-of-the-connector))"
 )
 AT_10_HZ = (
@@ -780,7 +780,7 @@ def _connector_comparison(tables: Path) -> Entry:
             _connector_sentence("skgrl", "sKGRL"),
             *(
                 f"in the present contact {_percent(pd.concat(runs)['success'].mean())} of the first ten training "
-                f"episodes of {len(runs)} runs of {method} succeed"
+                f"episodes of {len(runs)} runs of {method.replace('kgrl', 'KGRL')} succeed"
                 for method, runs in _present_runs(tables).items()
             ),
         ),

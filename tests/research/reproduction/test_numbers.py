@@ -172,6 +172,9 @@ def test_numbers_of_the_connector():
     )
     assert [len(rows) for rows in random.values()] == [5, 3]
     assert kgrl["training_mean_force"].mean() / skgrl["training_mean_force"].mean() == pytest.approx(2.0, abs=0.1)
+    weaker = (kgrl["mean_squared_force"] < kgrl["training_mean_squared_force"]).sum()
+    shorter = (kgrl["mean_steps"] * 45 < kgrl["training_total_steps"]).sum()
+    assert f"less force in {weaker} and shorter episodes in {shorter} of 10 runs" in page()
     slow = rows_of("connector_thesis", "skgrl")
     assert (slow["training_success_rate"] == 0).all()
     assert f"in none of {slow['training_episodes'].sum():.0f} episodes" in page()
