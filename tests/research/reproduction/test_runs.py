@@ -2,17 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.tables import table_text
+from guiderail.tools.tables import read_table
 from guiderail_studies.job import Job
 from research.reproduction import runs as module
 from research.reproduction.command import main
 from research.reproduction.runs import FIGURES, find_runs, jobs_of, remaining_hours
-from research.reproduction.tables import _merge
+from research.reproduction.tables import store
 from research.studies import study_names
 
 CLAMP = FIGURES["3.10"][0]
@@ -61,17 +62,25 @@ def test_command_refuses_runs_that_are_not_resumed(tmp_path, monkeypatch):
         main(["--figure", "3.10", "--out", str(tmp_path)])
 
 
-def test_stored_runs_stay_unless_the_folder_has_as_many_episodes(tmp_path):
+def fake_job(folder, method, seed, episodes, value):
+    """Return a job with a number of finished training episodes, all with the same return."""
+    rows = pd.DataFrame({"episode": range(episodes), "return": value})
+    folder.mkdir(exist_ok=True)
+    (folder / "episodes.csv").touch()
+    run = SimpleNamespace(path=folder, episodes=lambda: rows)
+    return SimpleNamespace(method=method, seed=seed, learns=True, after_episodes=[], folder=run)
+
+
+def test_stored_runs_stay_unless_the_folder_has_as_many_episodes(tmp_path, monkeypatch):
     """The runs of figure 4.5 don't remove those of figure 5.6 from their table, nor does an unfinished run."""
-    file = tmp_path / "table.csv"
-
-    def run(method, seed, episodes, value):
-        return pd.DataFrame({"method": method, "seed": seed, "episode": range(episodes), "return": value})
-
-    stored = [run("kgrl", 0, 3, 1.0), run("kgrl", 1, 3, 1.0), run("skgrl", 0, 3, 1.0)]
-    file.write_text(table_text(pd.concat(stored)))
-    merged = _merge(file, [run("kgrl", 0, 2, 2.0), run("kgrl", 1, 3, 2.0), run("residual", 0, 1, 2.0)])
-    means = merged.groupby(["method", "seed"])["return"].mean().to_dict()
+    for jobs in (
+        [("kgrl", 0, 3, 1.0), ("kgrl", 1, 3, 1.0), ("skgrl", 0, 3, 1.0)],
+        [("kgrl", 0, 2, 2.0), ("kgrl", 1, 3, 2.0), ("residual", 0, 1, 2.0)],
+    ):
+        fakes = [fake_job(tmp_path / "runs", *job) for job in jobs]
+        monkeypatch.setattr("research.reproduction.tables.jobs_of", lambda runs, out, fakes=fakes: fakes)
+        (file,) = store(CLAMP, tmp_path, tmp_path)
+    means = read_table(file).groupby(["method", "seed"])["return"].mean().to_dict()
     assert means == {("kgrl", 0): 1.0, ("kgrl", 1): 2.0, ("skgrl", 0): 1.0, ("residual", 0): 2.0}
 
 
