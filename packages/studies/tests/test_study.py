@@ -441,7 +441,7 @@ INVALID = [
     ({"methods": {}}, "methods"),
     ({"seeds": []}, "seeds"),
     ({"seeds": ["x"]}, "seeds"),
-    ({"seeds": [True]}, "seeds, 0: input should be a valid integer, not True"),
+    ({"seeds": [True]}, "seeds.0: input should be a valid integer, not True"),
     ({"seeds": [-1]}, "greater than or equal to 0"),
     ({"seeds": [0, 0]}, "the seed 0 is given twice"),
     ({"methods": {"learner": {"seeds": [3, 3]}}}, "the seed 3 is given twice"),
