@@ -549,7 +549,7 @@ def test_load_study_refuses_a_missing_file(tmp_path):
 @pytest.mark.parametrize(
     ("seeds", "message"),
     [
-        ([-1], "seeds, 0: .*not -1"),
+        ([-1], r"seeds\.0: .*not -1"),
         ([1, 2, 1], "seed 1 is given twice"),
         ([], "seeds"),
         ([1.5], "1.5"),
