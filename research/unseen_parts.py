@@ -5,11 +5,10 @@ Then the parts are prepared, a policy is trained over the training parts with ea
 on the held-out parts: uniform random actions, the scripted search (with the contact map, and by the center of pressure
 alone), policies of single training parts, specialists of the held-out parts, the general policy of each seed, and the
 mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, in MuJoCo,
-and on the first `--few-shot` parts with a half and a quarter of the plant's step. On the same parts, specialists that
-learn from scratch are compared with those that the general policy demonstrates to, and the former are evaluated on the
-other parts. Every finished step is stored, and the same command resumes. `rows/` has
-the episodes of each policy on each part, `table.md` the successes, `contact.csv` the drag of each held-out part on its
-rim.
+and on the first `--few-shot` parts with plant steps of 5 and 2.5 ms. On the same parts, specialists that learn from
+scratch are compared with those that the general policy demonstrates to, and the former are evaluated on the other parts.
+Every finished step is stored, and the same command resumes. `rows/` has the episodes of each policy on each part,
+`table.md` the successes, `contact.csv` the drag of each held-out part on its rim.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ import pandas as pd
 from scipy.stats import wilcoxon
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.diagrams.tasks.contact_probe import SPEEDS, drag
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import task_named
@@ -45,8 +43,8 @@ CONDITIONS = {
     "hard": ENVIRONMENT,
     "automate": ENVIRONMENT | {"difficulty": "automate"},
     "mujoco": ENVIRONMENT | {"station": "mujoco"},
-    "half_step": ENVIRONMENT | {"time_step": PLANT_PERIOD / 2},
-    "quarter_step": ENVIRONMENT | {"time_step": PLANT_PERIOD / 4},
+    "step_5_ms": ENVIRONMENT | {"time_step": 0.005},
+    "step_2.5_ms": ENVIRONMENT | {"time_step": 0.0025},
     "center_of_pressure": ENVIRONMENT | {"observation": "center_of_pressure"},  # for a search without a contact map
 }
 FEW_SHOT = (10, 20, 40, 80)  # training episodes after which a specialist is evaluated
@@ -257,7 +255,7 @@ def main(arguments: list[str]) -> None:
     for part in held_out:
         evaluate_part(part, {"scripted": "scripted"}, args.evaluated, out, "center_of_pressure")
     few = held_out[: args.few_shot]
-    for condition, parts in {"automate": held_out, "mujoco": held_out, "half_step": few, "quarter_step": few}.items():
+    for condition, parts in {"automate": held_out, "mujoco": held_out, "step_5_ms": few, "step_2.5_ms": few}.items():
         for part in parts:
             evaluate_part(part, general, args.evaluated, out, condition)
     for part in held_out if args.specialists else ():

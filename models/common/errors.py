@@ -100,10 +100,20 @@ class MissingExtraError(InputError, ImportError):
     """Error for a missing dependency of an extra; the message names the command that installs it."""
 
 
+LIBRARIES = {"libglib-2.0.so.0": "libglib2.0-0"}
+"""Debian's package by the name of a library of the operating system that Drake needs."""
+
+
 def explain_missing(error: ImportError) -> MissingExtraError | None:
-    """Return an error that names the extra to install; None if no extra installs the missing module."""
+    """Return an error that names what to install; None if that is unknown."""
+    library = str(error).partition(":")[0]
+    if library in LIBRARIES:
+        return MissingExtraError(
+            f"Drake needs {library}, which this machine lacks: install it (Debian, Ubuntu: apt install "
+            f"{LIBRARIES[library]})"
+        )
     module = (error.name or "").partition(".")[0]
-    if module not in EXTRAS:
+    if not isinstance(error, ModuleNotFoundError) or module not in EXTRAS:
         return None
     software, extra = EXTRAS[module]
     return MissingExtraError(f'this needs {software}, which is not installed: pip install "guiderail[{extra}]"')

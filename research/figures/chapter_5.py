@@ -147,19 +147,27 @@ def figure_5_4(out: Path) -> dict[str, Any]:
         time.plot(
             period * np.arange(step, len(path)), path[step:, 0], color=color, label=f"{push:+.2f} m at y {height}"
         )
-        rows.append(_recovery(height, push, step, nominal, path, commanded, row))
+        is_into_zone = bool(pushed[0] > PassageGeometry().zone_x)
+        rows.append(_recovery(height, push, step, nominal, path, commanded, row) | {"is_into_zone": is_into_zone})
     env.close()
     time.axhline(PassageGeometry().zone_x, color="firebrick", linewidth=0.8)
     time.set(xlabel="time [s]", ylabel="x [m]")
     time.legend(frameon=False, fontsize=8)
     plane.legend(frameon=False, fontsize=8, loc="upper left")
-    half = {height: [row["steps_to_half"] for row in rows if row["y"] == height] for height in (0.20, 0.54)}
+    half = {
+        height: [row["steps_to_half"] for row in rows if row["y"] == height and not row["is_into_zone"]]
+        for height in (0.20, 0.54)
+    }
     return {
         **save_results(out, "figure_5_4", figure, rows),
         "all reach the goal": bool(all(row["success"] for row in rows)),
         "max. commanded violation": max(row["max_commanded_violation"] for row in rows),
         "steps until half recovered, where demonstrations differ": str(half[0.20]),
         "steps until half recovered, in the passage": str(half[0.54]),
+        "steps until half recovered, after a push into the zone": str(
+            [row["steps_to_half"] for row in rows if row["is_into_zone"]]
+        ),
+        "measured steps in the zone after a push": max(row["steps_measured_in_the_zone"] for row in rows),
         "condition": "the history is the measured pose (P = 1), the action zero",
     }
 
@@ -401,16 +409,32 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
                     axis.plot(time, 1e3 * row["measured"][:, output], color="0.5", linewidth=0.8)
                     axis.set(ylabel=f"{name} [mm]", xlabel="time [s]")
                 numbers = {key: row[key] for key in row if key.startswith(("jerk", "max_", "peak"))}
-                rows.append({"method": kind, **numbers})
+                largest = {
+                    f"largest_step_{which}": float(np.linalg.norm(np.diff(row[which][:, :2], axis=0), axis=1).max())
+                    for which in ("commanded", "measured")
+                }
+                rows.append({"method": kind, **largest, **numbers})
         env.close()
         axes[0, index].set_title(f"{label(kind)}: commanded, and measured in gray")
     for axis in axes.flat:
         for bound in (-1e3 * ALIGNMENT, 1e3 * ALIGNMENT):
             axis.axhline(bound, color="firebrick", linewidth=0.8)
         axis.set_ylim(-1.2e3 * ALIGNMENT, 1.2e3 * ALIGNMENT)
+    means = pd.DataFrame(rows).groupby("method").mean(numeric_only=True)
+    numbers_of = {
+        "sKGRL's largest change of x, y in a control step": "largest_step_{}",
+        "sKGRL's linear jerk": "jerk_{}_linear",
+    }
     return {
         **save_results(out, "figure_5_8", figure, rows),
         "demonstrations": bnc_connector.NUM_DEMONSTRATIONS,
+        **{
+            f"{name} below KGRL's, {which}": (
+                f"{means.loc['kgrl', column.format(which)] / means.loc['skgrl', column.format(which)]:.1f} times"
+            )
+            for name, column in numbers_of.items()
+            for which in ("commanded", "measured")
+        },
         "condition": "random actions in x and y for ten control steps, gains calibrated by authority",
     }
 

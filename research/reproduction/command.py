@@ -12,7 +12,7 @@ def main(arguments: list[str]) -> None:
     parser = Parser(
         "thesis",
         "Train the runs of the thesis's figures, store their episodes, and write the report docs/thesis.md. The cost "
-        "in core-hours is printed first. Without --figure, the report is written from the stored tables.",
+        "of training in core-hours is printed first. Without --figure, the report is written from the stored tables.",
         "--figure 3.5 --resume",
     )
     parser.add_argument(

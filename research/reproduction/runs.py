@@ -32,16 +32,25 @@ class Runs:
             pouring, of RL without a template there and of `kgrl_pixels` are estimates, the others are measured.
         stops: True if a run ends after `SUCCESSES` consecutive successes.
         methods: Names of the methods that the figure needs; empty for all methods.
+        columns: Further columns of an episode that are stored.
     """
 
     study: str
     seconds: dict[str, float]
     stops: bool = False
     methods: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
 
 
 _PASSAGE = {"": 0.42}
 _POURING = {"": 4.4, "rl_shaped": 4.0, "rl_sparse": 4.0}
+_CONNECTOR = Runs(
+    "connector_10hz",
+    {"": 3.2},
+    methods=("kgrl", "skgrl"),
+    columns=("jerk_commanded_angular", "jerk_measured_linear", "jerk_measured_angular"),
+)
+_DEMONSTRATION = replace(_CONNECTOR, methods=("demonstration",))
 FIGURES: dict[str, tuple[Runs, ...]] = {
     "3.5": (Runs("thesis_pouring_sac", _POURING, stops=True),),
     "3.6": (Runs("thesis_pouring_tqc", _POURING | {"": 6.0}, stops=True),),
@@ -51,9 +60,12 @@ FIGURES: dict[str, tuple[Runs, ...]] = {
     ),
     "3.10": (Runs("thesis_grid_clamp", {"": 0.45}),),
     "3.11": (Runs("thesis_grid_clamp", {"": 0.45}),),
+    "4.1": (_DEMONSTRATION,),
     "4.5": (Runs("thesis_narrow_passage", _PASSAGE, methods=("kgrl", "residual", "safe_residual")),),
     "4.6": (Runs("thesis_narrow_passage", _PASSAGE, methods=("kgrl", "residual", "safe_residual")),),
     "4.7": (Runs("narrow_passage_images", {"": 4.1, "kgrl_pixels": 35.0}),),
+    "4.8": (_CONNECTOR,),
+    "5.1": (_DEMONSTRATION,),
     "5.6": (
         Runs(
             "thesis_narrow_passage",
@@ -61,6 +73,8 @@ FIGURES: dict[str, tuple[Runs, ...]] = {
             methods=("kgrl", "skgrl", "kgrl_constant", "skgrl_constant"),
         ),
     ),
+    "5.9": (_CONNECTOR,),
+    "5.10": (_CONNECTOR,),
     "hard": (Runs("pouring_hard_shield", {"": 2.4}),),
 }
 """Runs by figure of the thesis; "hard" is pouring at difficulty hard, which the thesis does not have."""

@@ -99,7 +99,7 @@ def main(arguments: list[str] | None = None) -> None:
         print_message(message)
         code = 2
     except Exception as error:
-        missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None
+        missing = explain_missing(error) if isinstance(error, ImportError) else None
         if missing is None and not hasattr(error, "format_message"):
             raise
         print_message(str(missing) if missing is not None else _usage_sentence(error, arguments))

@@ -441,7 +441,7 @@ INVALID = [
     ({"methods": {}}, "methods"),
     ({"seeds": []}, "seeds"),
     ({"seeds": ["x"]}, "seeds"),
-    ({"seeds": [True]}, "seeds, 0: input should be a valid integer, not True"),
+    ({"seeds": [True]}, "seeds.0: input should be a valid integer, not True"),
     ({"seeds": [-1]}, "greater than or equal to 0"),
     ({"seeds": [0, 0]}, "the seed 0 is given twice"),
     ({"methods": {"learner": {"seeds": [3, 3]}}}, "the seed 3 is given twice"),
@@ -549,7 +549,7 @@ def test_load_study_refuses_a_missing_file(tmp_path):
 @pytest.mark.parametrize(
     ("seeds", "message"),
     [
-        ([-1], "seeds, 0: .*not -1"),
+        ([-1], r"seeds\.0: .*not -1"),
         ([1, 2, 1], "seed 1 is given twice"),
         ([], "seeds"),
         ([1.5], "1.5"),

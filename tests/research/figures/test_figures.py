@@ -35,7 +35,8 @@ def test_find_figure_returns_a_function(figure):
 
 
 def test_thesis_results_exist_for_all_figures():
-    assert set(THESIS) == set(FIGURES)
+    photographs = {"4.1", "5.1"}  # with a result, but nothing to draw
+    assert set(THESIS) == set(FIGURES) | photographs
 
 
 @pytest.mark.parametrize("figure", ["2.2", "3.4", "5.3", "table 3.2", "table 4.1"])
@@ -75,8 +76,9 @@ def test_figure_5_4_recovers_from_pushes(tmp_path):
     assert rows["success"].all()
     assert (rows["steps_measured_in_the_zone"] <= 1).all()
     assert rows["max_commanded_violation"].max() <= 1e-9
-    wide, narrow = (rows[rows["y"] == y]["steps_to_half"] for y in (0.20, 0.54))
-    assert narrow.max() < wide.max()
+    recovering = rows[~rows["is_into_zone"].astype(bool)]  # the constraint shortens the return from the zone
+    wide, narrow = (recovering[recovering["y"] == y]["steps_to_half"] for y in (0.20, 0.54))
+    assert narrow.max() < wide.min()
 
 
 def write_finished_run(out, study, method, seed, endings):

@@ -2,14 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.tools.tables import read_table
 from guiderail_studies.job import Job
 from research.reproduction import runs as module
 from research.reproduction.command import main
 from research.reproduction.runs import FIGURES, find_runs, jobs_of, remaining_hours
+from research.reproduction.tables import store
 from research.studies import study_names
 
 CLAMP = FIGURES["3.10"][0]
@@ -56,6 +60,28 @@ def test_command_refuses_runs_that_are_not_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr("research.reproduction.command.num_done", lambda job: 1)
     with pytest.raises(InputError, match="give --resume"):
         main(["--figure", "3.10", "--out", str(tmp_path)])
+
+
+def fake_job(folder, method, seed, episodes, value):
+    """Return a job with a number of finished training episodes, all with the same return."""
+    rows = pd.DataFrame({"episode": range(episodes), "return": value})
+    folder.mkdir(exist_ok=True)
+    (folder / "episodes.csv").touch()
+    run = SimpleNamespace(path=folder, episodes=lambda: rows)
+    return SimpleNamespace(method=method, seed=seed, learns=True, after_episodes=[], folder=run)
+
+
+def test_stored_runs_stay_unless_the_folder_has_as_many_episodes(tmp_path, monkeypatch):
+    """The runs of figure 4.5 don't remove those of figure 5.6 from their table, nor does an unfinished run."""
+    for jobs in (
+        [("kgrl", 0, 3, 1.0), ("kgrl", 1, 3, 1.0), ("skgrl", 0, 3, 1.0)],
+        [("kgrl", 0, 2, 2.0), ("kgrl", 1, 3, 2.0), ("residual", 0, 1, 2.0)],
+    ):
+        fakes = [fake_job(tmp_path / "runs", *job) for job in jobs]
+        monkeypatch.setattr("research.reproduction.tables.jobs_of", lambda runs, out, fakes=fakes: fakes)
+        (file,) = store(CLAMP, tmp_path, tmp_path)
+    means = read_table(file).groupby(["method", "seed"])["return"].mean().to_dict()
+    assert means == {("kgrl", 0): 1.0, ("kgrl", 1): 2.0, ("skgrl", 0): 1.0, ("residual", 0): 2.0}
 
 
 def test_training_ends_after_consecutive_successes(tmp_path, monkeypatch):

@@ -243,6 +243,26 @@ def test_command_of_missing_sibling_names_the_line_that_installs_it(name, siblin
     assert (code, err) == (2, f"guiderail: {line}\n")
 
 
+def test_missing_library_of_the_system_is_named_with_its_package(capsys, monkeypatch):
+    def fail(name=""):
+        raise ImportError("libglib-2.0.so.0: cannot open shared object file: No such file", name="pydrake.common")
+
+    monkeypatch.setattr(main_module, "load_commands", fail)
+    message = (
+        "Drake needs libglib-2.0.so.0, which this machine lacks: install it (Debian, Ubuntu: apt install libglib2.0-0)"
+    )
+    assert call(capsys, "list") == (2, "", f"guiderail: {message}\n")
+
+
+def test_import_that_fails_inside_a_dependency_is_a_bug(capsys, monkeypatch):
+    def fail(name=""):
+        raise ImportError("cannot import name 'a' from 'pydrake'", name="pydrake")
+
+    monkeypatch.setattr(main_module, "load_commands", fail)
+    with pytest.raises(ImportError, match="cannot import name"):
+        call(capsys, "list")
+
+
 def test_help_lists_the_choices(capsys):
     for command, choices in (
         (["train"], ("NarrowPassage", "skgrl", "tqc", "tqc_contact", "aligned", "center_of_pressure", "hand_shaped")),

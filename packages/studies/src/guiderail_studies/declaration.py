@@ -277,7 +277,7 @@ def source_file(out: Path, study: str) -> Path:
 def sentence(error: ValidationError, kinds: tuple[type[Strict], ...] = ()) -> str:
     """Return the first validation error as one sentence; `kinds` are the declarations, by default those of a study."""
     first = error.errors()[0]
-    where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
+    where = " ".join(".".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":
         known = {
             n for kind in kinds or (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio) for n in kind.model_fields

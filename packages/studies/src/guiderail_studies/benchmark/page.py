@@ -111,6 +111,7 @@ def _blocks(protocol: Protocol, entries: Sequence[Entry]) -> list[Block]:
     blocks = [Block(TITLE, [intro]), _overall(protocol, order)]
     blocks += [block for name in protocol.tasks if (block := _task_block(protocol, name, order)) is not None]
     definitions = [[c.name.replace("_", " "), c.unit or MISSING, c.description] for c in COLUMNS]
+    definitions.append(["core seconds", "s", "CPU time of training and evaluation"])
     blocks.append(Block("Columns of the table of a submission", [], ["column", "unit", "definition"], definitions))
     return blocks
 

@@ -197,11 +197,22 @@ def shipped_methods() -> dict[str, BenchmarkMethod]:
     return {name: BenchmarkMethod.model_validate({"name": name, **values}) for name, values in methods.items()}
 
 
+def check_method_name(method: BenchmarkMethod, source: Path) -> None:
+    """Raise an InputError if a method of this package has the same name and other choices.
+
+    The page compares all methods with a method of this package, which it finds by its name.
+    """
+    shipped, choices = shipped_methods().get(method.name), {"env", "learner", "tasks"}
+    if shipped is not None and method.model_dump(include=choices) != shipped.model_dump(include=choices):
+        raise InputError(f"{source}: the method {method.name} of this package has other choices: give another name")
+
+
 def load_method(name_or_file: str) -> BenchmarkMethod:
     """Return a method of this package by name, or read the YAML file of a method.
 
     Raises:
-        InputError: If there is no such method, or the file is not valid.
+        InputError: If there is no such method, or the file is not valid, names a task of no protocol, or has the name
+            of another method of this package.
     """
     if not name_or_file.endswith((".yaml", ".yml")):
         methods = shipped_methods()
@@ -216,9 +227,14 @@ def load_method(name_or_file: str) -> BenchmarkMethod:
     if not isinstance(content, dict):
         raise InputError(f"{file} is no method: it needs at least name")
     try:
-        return BenchmarkMethod.model_validate({"name": file.stem, **content})
+        method = BenchmarkMethod.model_validate({"name": file.stem, **content})
     except ValidationError as error:
         raise InputError(f"{file}: {sentence(error, (BenchmarkMethod, TaskChoice, LearnerChoice))}") from error
+    check_method_name(method, file)
+    known = {name for path in PROTOCOLS.glob("*.yaml") for name in load_protocol(path.stem).tasks}
+    if unknown := sorted(set(method.tasks) - known):
+        raise InputError(f"{file}: no protocol has a task {unknown[0]!r}: {did_you_mean(unknown[0], known)}")
+    return method
 
 
 def make_study(

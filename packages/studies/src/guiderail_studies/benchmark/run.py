@@ -163,14 +163,17 @@ def run_method(
     chosen = [name for name in protocol.select(tasks) if method.applies(name)]
     numbers = list(protocol.seeds if seeds is None else seeds)
     if unknown := [seed for seed in numbers if seed not in protocol.seeds]:
-        raise InputError(f"protocol {protocol.version} has no seed {unknown[0]}: its seeds are {protocol.seeds}")
+        raise InputError(
+            f"protocol {protocol.version} has no seed {unknown[0]}: its seeds are {', '.join(map(str, protocol.seeds))}"
+        )
     if not chosen:
         raise InputError(f"{method.name} does not apply to these tasks: name others")
     studies = [method_study(protocol, name, method, numbers) for name in chosen]
     _write_method(protocol, method, chosen, out)
     hours = estimate_hours(protocol, method, chosen, len(numbers))
     number = len(chosen) * len(numbers)
-    log(f"{number} runs of {method.name}, about {hours:.2g} core-hours; finished runs are not repeated")
+    runs = f"{number} run{'s' * (number > 1)} of {method.name}"
+    log(f"{runs}, about {hours:.2g} core-hours; finished runs are not repeated")
     result: dict[str, Any] = {}
     for study, name in zip(studies, chosen, strict=True):
         rows = run_study(study, out / name, engine)

@@ -24,13 +24,20 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import read_table, table_text
-from guiderail_studies.benchmark.protocol import EVALUATED_FILE, BenchmarkMethod, Protocol, load_protocol
+from guiderail_studies.benchmark.protocol import (
+    EVALUATED_FILE,
+    BenchmarkMethod,
+    Protocol,
+    check_method_name,
+    load_protocol,
+)
 from guiderail_studies.benchmark.run import check_digests, finished_runs, run_row, stored_method
 from guiderail_studies.declaration import Strict
 
 FORMAT = "guiderail benchmark submission 1"
 SUBMISSION, TABLE, TRAINING_FILE = "submission.json", "table.csv", "training.csv"
-POLICY_FILES = ("policy.json", "policy.safetensors")
+WEIGHTS = "policy.safetensors"
+POLICY_FILES = ("policy.json", WEIGHTS)
 RUN_FILES = (*POLICY_FILES, TRAINING_FILE, EVALUATED_FILE)
 MAX_SIZE = 2_000_000  # largest size of `submission.json` [bytes]
 MAX_FILE_SIZE = 200_000_000  # largest size of a file of a run [bytes]
@@ -114,7 +121,8 @@ def read_submission(folder: Path) -> tuple[Submission, Protocol]:
     Nothing is executed: `submission.json` and tables are text, and policies are arrays of numbers.
 
     Raises:
-        InputError: If a file is missing, damaged, a link or not part of the submission, or the protocol is unknown.
+        InputError: If a file is missing, damaged, a link or not part of the submission, the protocol is unknown, the
+            method has the name of another one of this package, or two seeds have the same policy.
     """
     file = folder / SUBMISSION
     if not folder.is_dir() or not file.is_file():
@@ -129,16 +137,27 @@ def read_submission(folder: Path) -> tuple[Submission, Protocol]:
     if submission.format != FORMAT:
         raise InputError(f"{file} has another format than {FORMAT!r}: submit again with this version of guiderail")
     protocol = load_protocol(submission.protocol)
+    check_method_name(submission.method, file)
     check_digests(protocol, submission.digests, folder)
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()} - {SUBMISSION}
-    expected = {TABLE, *(f"{task}/{seed}/{name}" for task, seed in _runs(submission, protocol) for name in RUN_FILES)}
-    different = sorted(found ^ set(submission.files)) or sorted(found ^ expected)
-    different = different or sorted({*submission.digests} ^ {task for task, _ in _runs(submission, protocol)})
-    if different:
-        raise InputError(f"{folder} has a file too many or too few, {brief(different[0])}: submit again")
+    runs = _runs(submission, protocol)
+    if not runs:
+        raise InputError(f"{file} names no run of protocol {protocol.version}: submit again")
+    expected = {TABLE, *(f"{task}/{seed}/{name}" for task, seed in runs for name in RUN_FILES)}
+    if missing := sorted((expected | set(submission.files)) - found):
+        raise InputError(f"{folder} lacks the file {brief(missing[0])}: submit again")
+    if further := sorted(found - expected) or sorted(found - set(submission.files)):
+        raise InputError(f"{folder} has a file that is not part of it, {brief(further[0])}: submit again")
+    if different := sorted({*submission.digests} ^ {task for task, _ in runs}):
+        raise InputError(f"{file} has runs or rules, but not both, of the task {brief(different[0])}: submit again")
     for name, digest in submission.files.items():
         if file_digest(folder / name) != digest:
             raise InputError(f"{folder / name} was changed after the submission was written: submit again")
+    policies: dict[tuple[str, str], int] = {}
+    for task, seed in runs:
+        other = policies.setdefault((task, submission.files[f"{task}/{seed}/{WEIGHTS}"]), seed)
+        if other != seed:
+            raise InputError(f"{folder} has the same policy of {task} for seeds {other} and {seed}: train each seed")
     return submission, protocol
 
 
@@ -147,7 +166,7 @@ def _runs(submission: Submission, protocol: Protocol) -> list[tuple[str, int]]:
     runs = []
     for task in protocol.tasks:
         for seed in protocol.seeds:
-            if f"{task}/{seed}/{EVALUATED_FILE}" in submission.files:
+            if any(name.startswith(f"{task}/{seed}/") for name in submission.files):
                 runs.append((task, seed))
     return runs
 
@@ -210,10 +229,6 @@ def verify(
     """
     submission, protocol = read_submission(folder)
     table = read_table_of(folder, submission, protocol)
-    different = {name for name, version in submission.versions.items() if installed_versions().get(name) != version}
-    if different:
-        names = ", ".join(f"{name} {submission.versions[name]}" for name in sorted(different))
-        raise InputError(f"episodes agree bit for bit only with the versions of {folder}: install {names}")
     if not 1 <= episodes <= protocol.episodes:
         raise InputError(f"--episodes is from 1 to {protocol.episodes}, not {episodes}")
     rng = np.random.default_rng(seed)
@@ -221,23 +236,25 @@ def verify(
         sample = sorted(rng.choice(protocol.episodes, episodes, replace=False).tolist())
         environment = submission_environment(protocol, submission.method, task)
         where = folder / task / str(run_seed)
-        stored = read_table(where / EVALUATED_FILE)
+        stored = read_table(where / EVALUATED_FILE).to_dict("records")
         for row in repeat_episodes(protocol, task, environment, Policy.load(where), run_seed, sample):
-            expected = stored.iloc[row["episode"]]
+            expected = stored[row["episode"]]
             if changed := _differences(row, expected):
                 name = changed[0]
                 raise InputError(
                     f"{task}, seed {run_seed}, episode {row['episode']} has {name} {brief(row.get(name))}, and the "
-                    f"submission states {brief(expected.get(name))}{_about_processor(submission)}"
+                    f"submission states {brief(expected.get(name))}: it is refused{_other_origin(submission)}"
                 )
         log(f"{task}, seed {run_seed}: episodes {', '.join(map(str, sample))} agree")
     return {"verified": episodes * len(table), "runs": len(table)}
 
 
-def _about_processor(submission: Submission) -> str:
-    if submission.processor == processor():
-        return ": the submission is refused"
-    return f": the submission is refused; it was run on another processor, {brief(submission.processor)}"
+def _other_origin(submission: Submission) -> str:
+    """Return the versions and the processor of a submission that differ here, because they can change the episodes."""
+    here = installed_versions() | {"processor": processor()}
+    there = submission.versions | {"processor": submission.processor}
+    other = [f"{name} {brief(there.get(name))}" for name, value in here.items() if there.get(name) != value]
+    return f"; it was run with {', '.join(other)}, unlike here" if other else ""
 
 
 def submission_environment(protocol: Protocol, method: BenchmarkMethod, task: str) -> dict[str, Any]:
@@ -258,7 +275,7 @@ def repeat_episodes(
             yield rollout(env, act, index=number, seed=protocol.first_seed + number, held_out=True)
 
 
-def _differences(row: Mapping[str, Any], expected: pd.Series) -> list[str]:
+def _differences(row: Mapping[str, Any], expected: Mapping[Any, Any]) -> list[str]:
     """Return the names of the columns in which an episode differs from the stored one."""
-    names = [*row, *(name for name in expected.index if name not in row)]
+    names = [*row, *(name for name in expected if name not in row)]
     return [name for name in names if name not in expected or _key(row.get(name)) != _key(expected[name])]
