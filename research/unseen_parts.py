@@ -6,7 +6,7 @@ on the held-out parts: uniform random actions, the scripted search (with the con
 alone), policies of single training parts, specialists of the held-out parts, the general policy of each seed, and the
 mean of their actions. The general policies are also evaluated under the uncertainty that AutoMate states, in MuJoCo,
 and on the first `--few-shot` parts with plant steps of 5 and 2.5 ms. On the same parts, specialists that learn from
-scratch are compared with those that the general policy demonstrates to, and the former are evaluated on the other parts.
+scratch are compared with those that the general policy demonstrates to, and the former are evaluated on the others.
 Every finished step is stored, and the same command resumes. `rows/` has the episodes of each policy on each part,
 `table.md` the successes, `contact.csv` the drag of each held-out part on its rim.
 """
