@@ -339,8 +339,8 @@ def test_scripted_search_follows_the_plug_below_the_rim(folder):
 
 
 @contextmanager
-def few_demonstrations(number=3):
-    """Record few demonstrations, and try one contact at one misalignment.
+def few_demonstrations(number=3, misaligned=1):
+    """Record few demonstrations, and try one contact, at one misalignment by default.
 
     Drag, contact map, pieces for MuJoCo, number of components and preview are left out: the task of `folder` has them.
     """
@@ -348,7 +348,7 @@ def few_demonstrations(number=3):
         patch.setattr(contact, "MAX_TRIALS", 1)
         patch.setattr(contact, "MIN_SPEED", 0.0)  # no other contact is tried on a slow machine
         for module in (contact, create_task_module):
-            patch.setattr(module, "MISALIGNMENTS", contact.MISALIGNMENTS[:1])
+            patch.setattr(module, "MISALIGNMENTS", contact.MISALIGNMENTS[:misaligned])
         for step in ("add_contact_map", "add_convex_pieces"):
             patch.setattr(trial, step, lambda folder, file, *_: file)
         patch.setattr(trial, "num_components", lambda *_: 3)
@@ -404,7 +404,7 @@ def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys, monkeypatc
     part = screw()
     arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
     monkeypatch.setattr(trial, "MAX_SESSIONS", 1)  # a single attempt at each demonstration, of which one seats the plug
-    with few_demonstrations(2):
+    with few_demonstrations(2, misaligned=0):
         call("create-task", *arguments, *part.options)
     assert "1 of 2" in capsys.readouterr().out
     file = read_task_file(tmp_path / "screw")
