@@ -53,6 +53,7 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
     key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
+    monkeypatch.setattr("guiderail_studies.certify._run_checker", lambda *_: "yes")  # the checker takes seconds
     for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
         verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
         assert verdict == f"no: the certificate's {name} is not that of NarrowPassage"
