@@ -181,8 +181,8 @@ def test_round_trip_is_measured_when_a_heartbeat_reports_the_command():
     ("fail", "failures", "is_repeating"),
     [
         (exit_program, 5, False),
-        *((unplugged, failures, False) for failures in (1, 38, 60)),
-        *((unplugged, failures, True) for failures in (5, 60)),
+        *((unplugged, failures, False) for failures in (1, 20, 38, 60)),
+        *((unplugged, failures, True) for failures in (5, 38, 60)),
     ],
 )
 def test_arm_is_damped_when_commands_fail(fail, failures, is_repeating):
