@@ -102,6 +102,11 @@ def test_closed_paths_gain_no_energy_at_a_fixed_reference():
         assert energy <= 1e-5
 
 
+def test_torque_within_its_limits_is_unchanged_by_a_force():
+    wrench = np.array([0.0, 0.0, 10.0, 0.1, 0.0, 0.0])
+    np.testing.assert_array_equal(clip_wrench(wrench, AXES, 18.0, 4.0), wrench)
+
+
 def test_pose_order_reverses_the_limits_of_the_torque():
     bound = WrenchBound(np.arange(1.0, 7.0), 18.0, 4.0)
     np.testing.assert_array_equal(bound.in_pose_order.axes, [1.0, 2.0, 3.0, 6.0, 5.0, 4.0])
