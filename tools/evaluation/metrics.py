@@ -6,13 +6,14 @@ An episode's numbers are computed from its `EpisodeTrace`, which contains all co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy  # `scipy.stats` is imported on first use
+import scipy  # `scipy.special` is imported on first use
 
 from guiderail.diagrams.envs.trace import QUASI_STATIC_TIME, EpisodeTrace, Metric, mean_jerk
 from guiderail.diagrams.envs.trace import TOLERANCE as TOLERANCE
@@ -33,8 +34,12 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     The episodes of several seeds are not pooled into one interval, because they are not independent: all episodes of
     one seed use the same policy.
     """
-    interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
+    k, n = int(successes), int(episodes)
+    # As `scipy.stats.binomtest(k, n).proportion_ci`, without the test's p-value, which takes milliseconds.
+    z, p = float(scipy.special.ndtri(0.5 + 0.5 * CONFIDENCE)), k / n
+    scale = 2.0 * (n + z**2)
+    center, delta = (2.0 * n * p + z**2) / scale, z / scale * math.sqrt(4.0 * n * p * (1.0 - p) + z**2)
+    return center - delta if k > 0 else 0.0, center + delta if k < n else 1.0
 
 
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
@@ -179,7 +184,9 @@ COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost"
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
     """Return a table of episodes unchanged; `source` is its file, for the message."""
     text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
-    fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
+    counts = [name for name in COUNTS if name in rows and name not in text]
+    with np.errstate(invalid="ignore"):  # an infinite number has no remainder
+        fractional = [name for name in counts if not (rows[name].to_numpy() % 1 == 0).all()]
     wrong = [*(text if len(rows) else ()), *fractional]
     if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():
         wrong = ["success"]

@@ -64,7 +64,13 @@ TARGETS = {
     "models/templates/template.py": TEMPLATES,
     "models/templates/parts.py": TEMPLATES,
     "models/control/command_filters.py": ["tests/models/control/test_keep_out.py"],
-    "models/control/wrench.py": ["tests/models/control/test_wrench.py"],
+    "models/control/wrench.py": [
+        "tests/models/control/test_wrench.py",
+        "tests/systems/test_center_of_pressure.py",
+        "tests/systems/test_mean_contact_point.py",
+        "tests/systems/test_wrench_sensor.py",
+        "tests/systems/test_wrong_arguments.py",
+    ],
     "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/joint_status.py": [f"{HARDWARE}/tests/models/test_joint_status.py"],
     f"{HARDWARE}/src/guiderail_hardware/models/message_sequence.py": [

@@ -90,7 +90,7 @@ def test_closed_paths_gain_no_energy_at_a_fixed_reference():
     """The tool moves along random closed paths; the force bound follows from the bounds per axis, as in `Impedance`."""
     rng = np.random.default_rng(2)
     bound = WrenchBound(AXES, float(np.linalg.norm(AXES[:3])), 10.0, 2.5e4)
-    for _ in range(40):
+    for _ in range(12):
         corners = np.vstack([np.zeros(3), rng.normal(scale=0.02, size=(4, 3)), np.zeros(3)])
         energy = 0.0
         for start, end in itertools.pairwise(corners):
@@ -100,6 +100,16 @@ def test_closed_paths_gain_no_energy_at_a_fixed_reference():
                 wrench = bounded_wrench(np.r_[-K * point, 0, 0, 0], np.r_[D * velocity, 0, 0, 0], velocity, MASS, bound)
                 energy += float(wrench[:3] @ (end - start)) / 399.0
         assert energy <= 1e-5
+
+
+def test_torque_within_its_limits_is_unchanged_by_a_force():
+    wrench = np.array([0.0, 0.0, 10.0, 0.1, 0.0, 0.0])
+    np.testing.assert_array_equal(clip_wrench(wrench, AXES, 18.0, 4.0), wrench)
+
+
+def test_pose_order_reverses_the_limits_of_the_torque():
+    bound = WrenchBound(np.arange(1.0, 7.0), 18.0, 4.0)
+    np.testing.assert_array_equal(bound.in_pose_order.axes, [1.0, 2.0, 3.0, 6.0, 5.0, 4.0])
 
 
 def test_lowered_bound_is_never_above_the_original():

@@ -1,0 +1,1 @@
+from coarse_connector import coarse_connector  # noqa: F401
