@@ -6,14 +6,13 @@ An episode's numbers are computed from its `EpisodeTrace`, which contains all co
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy  # `scipy.special` is imported on first use
+import scipy  # `scipy.stats` is imported on first use
 
 from guiderail.diagrams.envs.trace import QUASI_STATIC_TIME, EpisodeTrace, Metric, mean_jerk
 from guiderail.diagrams.envs.trace import TOLERANCE as TOLERANCE
@@ -34,12 +33,8 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     The episodes of several seeds are not pooled into one interval, because they are not independent: all episodes of
     one seed use the same policy.
     """
-    k, n = int(successes), int(episodes)
-    # As `scipy.stats.binomtest(k, n).proportion_ci`, without the test's p-value, which takes milliseconds.
-    z, p = float(scipy.special.ndtri(0.5 + 0.5 * CONFIDENCE)), k / n
-    scale = 2.0 * (n + z**2)
-    center, delta = (2.0 * n * p + z**2) / scale, z / scale * math.sqrt(4.0 * n * p * (1.0 - p) + z**2)
-    return center - delta if k > 0 else 0.0, center + delta if k < n else 1.0
+    interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
