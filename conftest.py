@@ -2,15 +2,12 @@
 
 import gc
 import os
-from copy import deepcopy
-from functools import wraps
 from importlib.util import find_spec
 
 import pytest
 from fork_server import Forks, start_forkserver
 from hypothesis import HealthCheck, settings
 
-from guiderail.models.common import yaml
 from guiderail.tools.evaluation import forks as evaluation_forks
 
 COMMON = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
@@ -51,25 +48,8 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure():
-    """Skip waiting for the disk, which every written file of a run would do; no test ends the power.
-
-    Equal texts are parsed once, because the same configurations and studies are read hundreds of times.
-    """
+    """Skip waiting for the disk, which every written file of a run would do; no test ends the power."""
     os.fsync = lambda file: None
-    yaml.parse_yaml = parse_once(yaml.parse_yaml)
-
-
-def parse_once(parse):
-    """Return a reader of YAML that returns copies of what it has read from the same text before."""
-    trees = {}
-
-    @wraps(parse)
-    def parse_or_copy(text, where="text"):
-        if text not in trees:
-            trees[text] = parse(text, where)
-        return deepcopy(trees[text])
-
-    return parse_or_copy
 
 
 FORKS = pytest.StashKey[Forks]()

@@ -43,18 +43,18 @@ def read_table(path: Path) -> pd.DataFrame:
         header, *rows = csv.reader(io.StringIO(data.decode("utf-8"), newline=""), strict=True)
         if not all(header) or len({*header}) != len(header):
             raise ValueError("missing or repeated names")
-        columns = zip(*rows, strict=True) if rows else (() for _ in header)
+        columns = zip(*rows, strict=True) if rows else ([] for _ in header)
         return pd.DataFrame({name: _parse_column(cells) for name, cells in zip(header, columns, strict=True)})
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is not a table of episodes: restore it, or train again") from error
 
 
-def _parse_column(cells: Sequence[str]) -> pd.Series | np.ndarray:
+def _parse_column(cells: Sequence[str]) -> pd.Series:
     """Return the cells of a column as integers, floats, booleans or text, the same type for all."""
-    if cells and all(map(_INTEGER.fullmatch, cells)):
-        return np.array([*map(int, cells)], dtype=np.int64)
-    if cells and all(cell == "" or _NUMBER.fullmatch(cell) for cell in cells):
-        return np.array([float(cell or "nan") for cell in cells])
+    if all(map(_INTEGER.fullmatch, cells)):
+        return pd.Series([*map(int, cells)], dtype=np.int64 if cells else object)
+    if all(cell == "" or _NUMBER.fullmatch(cell) for cell in cells):
+        return pd.Series([float(cell or "nan") for cell in cells])
     if {*cells} <= {"True", "False"}:
         return pd.Series([cell == "True" for cell in cells], dtype=object)
     return pd.Series(cells, dtype=object)

@@ -2,7 +2,6 @@
 
 import pytest
 from bead_runs import _bead_run, bead_config, bead_run, simplify_pictures  # noqa: F401
-from coarse_connector import coarse_connector  # noqa: F401
 
 
 @pytest.fixture(autouse=True, scope="session")

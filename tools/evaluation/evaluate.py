@@ -138,10 +138,8 @@ def evaluate_policies(
                 if progress is not None:
                     progress.update(row)
         table = pd.DataFrame(rows)
-        for column, kind in table.dtypes.items():
-            if isinstance(kind, pd.StringDtype):
-                table[column] = table[column].astype(object)  # as `read_table` returns stored rows
-        yield name, table, data
+        text = [column for column, kind in table.dtypes.items() if isinstance(kind, pd.StringDtype)]
+        yield name, table.astype(dict.fromkeys(text, object)), data  # as `read_table` returns stored rows
 
 
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **kwargs: Any) -> pd.DataFrame:

@@ -179,9 +179,7 @@ COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost"
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
     """Return a table of episodes unchanged; `source` is its file, for the message."""
     text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
-    counts = [name for name in COUNTS if name in rows and name not in text]
-    with np.errstate(invalid="ignore"):  # an infinite number has no remainder
-        fractional = [name for name in counts if not (rows[name].to_numpy() % 1 == 0).all()]
+    fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
     wrong = [*(text if len(rows) else ()), *fractional]
     if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():
         wrong = ["success"]

@@ -1,7 +1,6 @@
 """Exported skills in C++: laws equal to Python's, and a controller and a node with a double of ROS 2."""
 
 import functools
-import hashlib
 import json
 import re
 import shutil
@@ -47,28 +46,14 @@ def exported(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def compiled(request, tmp_path_factory):
-    """Return a function that compiles a program and returns its path.
-
-    Programs take 17 s. They stay in pytest's cache while compiler, options and preprocessed sources are the same.
-    """
-    cache = getattr(request.config, "cache", None)
-    folder = tmp_path_factory.mktemp("programs") if cache is None else cache.mkdir("cpp_programs")
+def compiled(tmp_path_factory):
+    """Return a function that compiles a program once and returns its path."""
 
     @functools.cache
     def compile_program(source, *options):
         command = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *options]
-        command += ["-I", SOURCE / "include", source]
-        version = subprocess.run(["g++", "--version"], capture_output=True, check=True).stdout
-        text = subprocess.run([*command, "-E", "-P"], capture_output=True, check=True).stdout
-        flags = [option for option in options if not isinstance(option, Path)]
-        digest = hashlib.sha256(b"".join([version, repr(flags).encode(), text])).hexdigest()
-        program = folder / f"{source.stem}-{digest}"
-        if not program.exists():
-            for earlier in folder.glob(f"{source.stem}-*"):
-                earlier.unlink()
-            subprocess.run([*command, "-o", program.with_suffix(".new")], check=True)
-            program.with_suffix(".new").rename(program)
+        program = tmp_path_factory.mktemp("programs") / source.stem
+        subprocess.run([*command, "-I", SOURCE / "include", source, "-o", program], check=True)
         return program
 
     return compile_program

@@ -181,7 +181,7 @@ def test_episode_is_bit_identical_for_the_same_seed(task):
 @pytest.mark.parametrize(
     ("task", "options", "modulus_factor", "max_steps"),
     [
-        ("BncConnector", {"fixture_offset": "none", "guidance": "kmp"}, 10.0, 250),
+        ("BncConnector", {"fixture_offset": "none", "guidance": "kmp"}, 10.0, 400),
         ("GridClamp", {}, 30.0, 100),
     ],
     ids=lambda value: None if isinstance(value, dict) else str(value),

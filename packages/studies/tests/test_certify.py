@@ -9,7 +9,6 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage import NarrowPassage, reference_trajectory
 from guiderail.models.common.errors import InputError
-from guiderail_studies.certificate import checker
 from guiderail_studies.certificate.adversary import Adversary
 from guiderail_studies.certify import _declared_start, _find_subject, certify_skill, verify_certificate
 
@@ -17,17 +16,9 @@ COARSE = {"control_period": 0.16}  # 50 steps instead of 400, because the time o
 
 
 @pytest.fixture
-def in_process(monkeypatch):
-    """Run the checker in this process, because a process takes a second."""
-
-    def run_checker(folder, key):
-        try:
-            checker.check(folder, None if key is None else key.read_bytes())
-        except checker.Rejected as reason:
-            return f"no: {reason}"
-        return "yes"
-
-    monkeypatch.setattr("guiderail_studies.certify._run_checker", run_checker)
+def unchecked(monkeypatch):
+    """Leave out the checker, a process that takes a second, where another test has its verdict."""
+    monkeypatch.setattr("guiderail_studies.certify._run_checker", lambda *_: "yes")
 
 
 def test_certify_skill_writes_an_accepted_certificate(tmp_path):
@@ -44,7 +35,7 @@ def test_certify_skill_writes_an_accepted_certificate(tmp_path):
     assert (tmp_path / "attack.csv").exists()
 
 
-def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatch, in_process):
+def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 800)
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
@@ -71,7 +62,7 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
         certify_skill("NarrowPassage", environment, out=folder, key=tmp_path / "none")
 
 
-def test_certify_skill_accepts_demonstrations_alone(tmp_path, monkeypatch, in_process):
+def test_certify_skill_accepts_demonstrations_alone(tmp_path, monkeypatch):
     """A NaN in the command of an attack violates a bound."""
     attack = Adversary.attack
 
@@ -109,17 +100,20 @@ def test_certify_skill_refuses_invalid_arguments(arguments, message, tmp_path):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, **{"out": tmp_path, **arguments})
 
 
-def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, in_process):
+@pytest.mark.parametrize(
+    ("difficulty", "clipped_seeds"),
+    [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds whose sampled start offset is clipped to its limit
+)
+def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, clipped_seeds):
     """Robot and history of sKGRL begin with an offset from the demonstrations."""
     monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 3_000)
-    environment = COARSE | {"guidance": "skgrl", "difficulty": "hard"}
+    environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
     result = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert result["checker"] == "yes"
-    assert result["start_within"] == pytest.approx([0.12, 0.12])
+    assert result["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
     certificate = json.loads((tmp_path / "certificate.json").read_text())
     env = make_env("NarrowPassage", **environment)
-    clipped = 1352, 8387  # seeds whose sampled start offset is clipped to its limit
-    for seed in (*clipped, *range(1_000_000, 1_000_004)):
+    for seed in (*clipped_seeds, *range(1_000_000, 1_000_004)):
         env.reset(seed=seed, options={"held_out": True})
         while not any(env.step(np.zeros(2))[2:4]):
             pass
@@ -140,7 +134,6 @@ def declared_start(task, **environment):
 
 def test_declared_start_adds_pose_bias_and_start_offset():
     assert not declared_start("BncConnector").any()
-    np.testing.assert_allclose(declared_start("NarrowPassage"), [0.04, 0.04])
     np.testing.assert_allclose(declared_start("BncConnector", start_offset_max=0.002), np.full(6, 0.002))
     np.testing.assert_allclose(
         declared_start("BncConnector", sensing={"pose_bias": 0.001}), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0]
@@ -177,9 +170,8 @@ def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_pat
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path)
 
 
-def test_via_points_move_the_motion_but_not_its_start(tmp_path, monkeypatch):
+def test_via_points_move_the_motion_but_not_its_start(tmp_path, unchecked):
     """A reset starts at the demonstrations, not at a via-point of the first step."""
-    monkeypatch.setattr("guiderail_studies.certify._run_checker", lambda *_: "yes")
     via = [0.0, 0.36, 0.1]
     certify_skill("NarrowPassage", COARSE | {"guidance": "kgrl", "via_points": via}, out=tmp_path)
     with np.load(tmp_path / "primitive.npz") as primitive:

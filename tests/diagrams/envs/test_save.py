@@ -8,6 +8,7 @@ from guiderail import make_env
 from guiderail.models.common.errors import InputError
 
 CASES = [
+    ("GridClamp", {"guidance": "sct", "station": "gantry", "action_repeat": 5}),
     ("GridClamp", {"guidance": "sct", "station": "arm", "sensing": "robot", "difficulty": "hard", "action_repeat": 5}),
     (
         "BncConnector",
@@ -19,6 +20,7 @@ CASES = [
             "disturbances.late_commands": 2,
         },
     ),
+    ("BncConnector", {"guidance": "kgrl", "time_step": 0.0025, "action_repeat": 5}),
     ("NarrowPassage", {"guidance": "kgrl", "action_repeat": 10}),
     ("NarrowPassage", {"guidance": "kgrl", "observation": "image", "action_repeat": 10}),
     ("Pouring", {"action_repeat": 5}),
@@ -57,7 +59,7 @@ def test_rest_of_an_episode_is_equal_bit_for_bit_when_restored(task, options):
 
 
 def test_interruption_changes_nothing_when_the_episode_continues():
-    env, actions = begin("GridClamp", {"guidance": "sct", "action_repeat": 5}, count=12)
+    env, actions = begin(*CASES[0], count=12)
     expected = steps(env, actions)
     env.reset(seed=3)
     results = []
@@ -70,7 +72,7 @@ def test_interruption_changes_nothing_when_the_episode_continues():
 
 
 def test_restored_observation_is_independent_of_the_returned_one():
-    env, actions = begin(*CASES[2])
+    env, actions = begin(*CASES[4])
     observation = env.step(actions[0])[0]
     expected, state = observation.copy(), env.save()
     for _ in range(2):
@@ -80,7 +82,7 @@ def test_restored_observation_is_independent_of_the_returned_one():
 
 
 def test_ended_episode_is_restored_as_ended():
-    env, actions = begin(*CASES[2], count=200)
+    env, actions = begin(*CASES[4], count=200)
     before = env.save()
     steps(env, actions)
     ended = env.save()
@@ -92,7 +94,7 @@ def test_ended_episode_is_restored_as_ended():
 
 
 def test_state_is_refused_when_it_does_not_fit():
-    env, _ = begin(*CASES[2])
+    env, _ = begin(*CASES[4])
     other = make_env("NarrowPassage", guidance="skgrl")
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         other.save()

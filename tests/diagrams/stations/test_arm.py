@@ -51,7 +51,7 @@ def displacement(before, after):
     return np.concatenate([after.translation() - before.translation(), rotation.angle() * rotation.axis()])
 
 
-@pytest.mark.parametrize("robot", ["panda", "ur5e"])  # a policy inserts with an iiwa14 in test_baselines
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_arm_inserts_and_locks_at_the_nominal_pose(robot):
     times, motion = insert_and_lock()
     driven, recording = drive_along(ArmStation(WORKCELL, robot=robot), times, motion)

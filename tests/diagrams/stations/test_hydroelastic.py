@@ -9,6 +9,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 # Task, options and action.
 CASES = {
     "connector": ("BncConnector", {"guidance": "kmp"}, np.zeros(2)),
+    "clamp": ("GridClamp", {}, DOWN),
     "clamp on an arm": ("GridClamp", {"station": "arm"}, DOWN),
 }
 

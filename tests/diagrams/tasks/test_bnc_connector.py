@@ -84,8 +84,9 @@ def test_demonstration_fails_when_the_offset_is_hidden(skgrl):
     assert evaluate_policy(skgrl, zero_policy(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
 
 
-def test_torque_search_locks_when_the_offset_is_hidden(skgrl):
-    rows = evaluate_policy(skgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
+@pytest.mark.parametrize("guidance", ["skgrl", "kgrl"])  # offset sampled per run and per episode
+def test_torque_search_locks_when_the_offset_is_hidden(guidance, request):
+    rows = evaluate_policy(request.getfixturevalue(guidance), scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
     assert rows["max_commanded_violation"].max() <= 1e-9
 
@@ -95,7 +96,7 @@ def safe_residual():
     return make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
 
 
-@pytest.mark.parametrize("guidance", ["skgrl", "safe_residual"])
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_commands_satisfy_the_constraint_under_any_action(guidance, request):
     """Random corners of the square of actions, which change at every step, for 5 s: approach, search and insertion."""
     env = request.getfixturevalue(guidance)

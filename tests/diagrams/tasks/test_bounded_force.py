@@ -13,6 +13,7 @@ from guiderail.models.common.errors import InputError
 PUSHES = [
     ("BncConnector", {"guidance": "kgrl"}, "gantry"),
     ("BncConnector", {"guidance": "residual", "action_dims": (0, 1, 2), "action_scale": 5.0}, "arm"),
+    ("BncConnector", {"guidance": "skgrl"}, "mujoco"),
     ("GridClamp", {"guidance": "sct"}, "gantry"),
     ("GridClamp", {"guidance": "none", "active_constraints": False}, "arm"),
 ]
@@ -42,8 +43,8 @@ def test_push_is_no_collision_when_force_is_bounded(task, options, station):
     assert 0.5 * limit < force < limit
 
 
-def test_push_is_a_collision_when_force_is_not_bounded():
-    task, options, station = PUSHES[-1]
+@pytest.mark.parametrize(("task", "options", "station"), [PUSHES[0], PUSHES[4]])
+def test_push_is_a_collision_when_force_is_not_bounded(task, options, station):
     termination, force, limit = push(task, station=station, bounded_force=False, **options)
     assert termination == "collision"
     assert force > limit

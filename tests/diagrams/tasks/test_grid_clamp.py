@@ -15,6 +15,7 @@ from guiderail.diagrams.tasks.grid_clamp import (
     straight_descent,
 )
 from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.transforms import MM
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
@@ -54,6 +55,11 @@ def env():
 @pytest.fixture(scope="module")
 def env_without_offsets():
     return make_env("GridClamp", fixture_offset="none")
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return make_env("GridClamp", station="arm", fixture_offset="none")
 
 
 def test_straight_descent_inserts_without_offsets(env_without_offsets):
@@ -119,6 +125,13 @@ def test_commands_stay_in_the_cuboid_under_any_action(guidance):
         assert env.trace.statistics()["peak_force"] < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
+def test_push_is_a_collision_without_the_cuboid():
+    env = make_env("GridClamp", guidance="none", active_constraints=False, bounded_force=False)
+    info, _, _ = play(env, lambda _: np.array([0, 0, -0.5, 0, 0, 0]), seed=0, options={"offset": (0.003, 0.0)})
+    assert info["termination"] == "collision"
+    assert info["impedance_force"] > COLLISION_FORCE
+
+
 def test_returns_of_both_rewards_differ_by_the_force_cost(env_without_offsets):
     without = make_env("GridClamp", fixture_offset="none", reward="no_force")
     _, with_cost, terms = play(env_without_offsets, lambda _: DOWN, seed=1)
@@ -136,6 +149,14 @@ def test_observation_has_position_and_force(env):
     assert position == pytest.approx(12.0 * MM, abs=0.1 * MM)
     assert force == pytest.approx(info["impedance_force"], rel=0.25)
     assert force > 5.0
+
+
+def test_arm_inserts_without_offsets(arm):
+    """The clamp descends at 12 mm/s; at a higher speed the arm's lateral error exceeds the chamfer."""
+    info, _, _ = play(arm, lambda _: 0.3 * DOWN, seed=1)
+    assert info["is_success"]
+    assert arm.trace.statistics()["peak_force"] <= 10.0
+    assert arm.trace.statistics()["collisions"] == 0
 
 
 class TestUncertainty:

@@ -90,7 +90,7 @@ def test_closed_paths_gain_no_energy_at_a_fixed_reference():
     """The tool moves along random closed paths; the force bound follows from the bounds per axis, as in `Impedance`."""
     rng = np.random.default_rng(2)
     bound = WrenchBound(AXES, float(np.linalg.norm(AXES[:3])), 10.0, 2.5e4)
-    for _ in range(12):
+    for _ in range(40):
         corners = np.vstack([np.zeros(3), rng.normal(scale=0.02, size=(4, 3)), np.zeros(3)])
         energy = 0.0
         for start, end in itertools.pairwise(corners):

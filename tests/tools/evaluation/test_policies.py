@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from onnx_file import linear_policy
-from sb3_contrib import TQC, CrossQ, RecurrentPPO
-from stable_baselines3 import PPO, SAC, TD3
+from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
@@ -30,7 +30,7 @@ def env():
     return make_environment("Bead", {})
 
 
-@pytest.mark.parametrize("kind", [SAC, TD3, PPO, TQC, CrossQ])
+@pytest.mark.parametrize("kind", [SAC, TD3, DDPG, PPO, A2C, TQC, TRPO, CrossQ])
 def test_zip_of_stable_baselines3_acts_as_the_model(kind, env, tmp_path):
     networks = {"net_arch": [8]}
     model = kind("MlpPolicy", env, policy_kwargs=networks, seed=1, device="cpu")

@@ -86,7 +86,6 @@ def test_page_is_self_contained_with_a_layout_for_phones(page):
     assert '<meta name="viewport" content="width=device-width' in text
     assert "<title>NarrowPassage · kgrl · constant" in text
     assert "@media (max-width: 700px)" in text
-    assert "transparent</button>" in text
     assert "<script src=" not in text
     assert "<link" not in text
 

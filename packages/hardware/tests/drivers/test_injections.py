@@ -12,6 +12,7 @@ from guiderail_hardware.systems.torque_safety_limiter import ArmState
 RNG = np.random.default_rng(0)
 STATUS, COMMAND = "on_status", "on_command"
 INJECTIONS = [
+    faults.message_loss(STATUS, 0.015),
     faults.message_loss(STATUS, 0.06),
     faults.message_delay(STATUS, 0.05),
     faults.message_duplication(STATUS, 0.02),
@@ -23,6 +24,7 @@ INJECTIONS = [
     faults.external_load(4, 120.0),
     faults.clock_jump(-3.0),
     faults.message_loss(COMMAND, 0.015),
+    faults.controller_pause(0.015),
     faults.controller_pause(0.3),
     faults.controller_kill(0.06),
     faults.robot_kill(0.05),

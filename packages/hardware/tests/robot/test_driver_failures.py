@@ -85,9 +85,10 @@ def test_failed_commands_are_reported_and_retried(make_executor):
     assert len(attempts) > 100
 
 
-def test_completed_skill_fails_when_the_arm_cannot_be_stopped(make_executor, monkeypatch):
+@pytest.mark.parametrize("failures", [1, 60])
+def test_completed_skill_fails_when_the_arm_cannot_be_stopped(make_executor, monkeypatch, failures):
     executor, clock = make_executor()
-    driver, rest, attempts, failures = executor._station.driver, executor._rest, [], 60
+    driver, rest, attempts = executor._station.driver, executor._rest, []
 
     def write(torque, time):
         attempts.append(time)

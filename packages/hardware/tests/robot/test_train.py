@@ -234,6 +234,7 @@ def test_arm_rests_when_one_status_before_control_is_wrong(monkeypatch):
     ("method", "replacement", "fault"),
     [
         ("read", unplugged, Fault.MALFORMED),
+        ("read", lambda: None, Fault.NO_STATUS),
         ("write", unplugged, Fault.COMMAND_FAILED),
     ],
 )
@@ -535,6 +536,7 @@ def test_push_distinguishes_inserted_and_loose_workpieces(env, inserted, monkeyp
     for robot_env, direction, max_motion, holds in (
         (env, pull, 1.0, False),  # for want of a force
         (inserted, pull, MAX_HOLD_MOTION, True),
+        (inserted, side, MAX_HOLD_MOTION, True),
         (inserted, side, -1.0, False),  # because of the motion
     ):
         test = HoldTest(tuple(HOLD_DISTANCE * np.array(direction)), max_motion)

@@ -1,1 +1,0 @@
-from coarse_connector import coarse_connector  # noqa: F401
