@@ -17,6 +17,7 @@ from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.wrench import (
     MAX_WRENCH_SIZE,
     POSE_ORDER,
+    MovingInertia,
     WrenchBound,
     admissible_change,
     approach_bound,
@@ -116,9 +117,9 @@ class ReferenceGovernor(LeafSystem):
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
     x_r is the output, x and v are the measured pose and velocity, K and D the stiffness and damping of the six
-    coordinates, and h is the time step. The spring accelerates the mass m to at most the speed F / (2 √(k m)), with the
-    force bound F and the contact stiffness k (see `slow_down`). If no limit is active, the desired pose is output
-    unchanged up to rounding.
+    coordinates, and h is the time step. The spring accelerates the mass m so that each contact has at most the speed
+    F / (2 √(k m)), with the force bound F and the contact stiffness k (see `slow_down`). If no limit is active, the
+    desired pose is output unchanged up to rounding.
 
     ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
     measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), the limits of [fx fy fz tx ty tz], of the norm
@@ -128,7 +129,7 @@ class ReferenceGovernor(LeafSystem):
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
         damping: Damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
-        mass: Moving mass [kg], positive.
+        inertia: Moving mass, and its smallest moment of inertia about the tool center.
         step: Time step of the plant [s], positive.
         bound: Bound of the wrench.
 
@@ -136,13 +137,15 @@ class ReferenceGovernor(LeafSystem):
         InputError: If an argument is out of range.
     """
 
-    def __init__(self, stiffness: np.ndarray, damping: np.ndarray, mass: float, step: float, bound: WrenchBound):
+    def __init__(
+        self, stiffness: np.ndarray, damping: np.ndarray, inertia: MovingInertia, step: float, bound: WrenchBound
+    ):
         super().__init__()
         check_period(step)
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "a reference governor")
-        if not 0.0 < as_number(mass, "mass") < np.inf:
-            raise InputError(f"the moving mass must be positive and finite, not {mass} kg")
-        self._mass, self._step, self._bound = mass, step, bound
+        if not all(0.0 < as_number(value, "inertia") < np.inf for value in inertia):
+            raise InputError(f"the moving mass and moment of inertia must be positive and finite, not {tuple(inertia)}")
+        self._inertia, self._step, self._bound = inertia, step, bound
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
@@ -164,7 +167,7 @@ class ReferenceGovernor(LeafSystem):
             self._damping,
             self._desired_pose_port.Eval(context) - pose,
             velocity,
-            self._mass,
+            self._inertia,
             self._step,
             bound.in_pose_order,
         )

@@ -20,6 +20,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import MovingInertia
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_checks import CommandWatchdog
 from guiderail.systems.wrench_limits import EnergyTank, PhaseWrenchLimit, ReferenceGovernor
@@ -212,7 +213,9 @@ def add_joint_impedance(
     governor = add_system(
         builder,
         "governor",
-        ReferenceGovernor(np.array(impedance.stiffness), damping, mass, time_step, impedance.bound),
+        ReferenceGovernor(
+            np.array(impedance.stiffness), damping, MovingInertia(mass, MIN_INERTIA), time_step, impedance.bound
+        ),
         desired_pose=tank.get_reference_pose_output_port(),
         max_wrench=tank.get_admitted_wrench_output_port(),
         state=state,

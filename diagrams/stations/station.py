@@ -80,6 +80,7 @@ _FINEST = 2**47  # largest denominator of a time step of which a day's multiples
 
 # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m].
 CONTACT_STIFFNESS = 2.5e4
+CONTACT_LEVER = 0.02  # distance of the contact from the tool center, if the workpiece is not known [m]
 
 
 @dataclass(frozen=True)
@@ -105,17 +106,17 @@ class Impedance:
         if not (np.isfinite(self.damping_ratio) and self.damping_ratio > 0.0):
             raise InputError(f"the impedance's damping_ratio must be positive, not {self.damping_ratio}")
 
-    def with_max_force(self, force: float) -> Impedance:
+    def with_max_force(self, force: float, lever: float = CONTACT_LEVER) -> Impedance:
         """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
-        No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
-        limited for contacts of at most `CONTACT_STIFFNESS`.
+        No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed
+        is limited for contacts of at most `CONTACT_STIFFNESS`, at most at the distance `lever` [m] from the tool center.
         """
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))
         axes = to_wrench_order(limits.tolist())
         norms = (float(np.linalg.norm(axes[:3])), float(np.linalg.norm(axes[3:])))
-        return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
+        return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS, lever))
 
 
 def max_wrench(force: float) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -40,6 +41,24 @@ class Workcell(Protocol):
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Exclude contact between pairs of geometries, after the plant is finalized."""
+
+
+def contact_lever(workcell: Workcell) -> float:
+    """Return the largest distance of the workpiece's contact geometry from the tool center [m], by bounding boxes."""
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    workpiece = workcell.add_workpiece(plant, plant.world_frame())
+    plant.Finalize()
+    X_PW = workpiece.body_frame().CalcPose(plant.CreateDefaultContext(), plant.world_frame())
+    inspector, corners = scene_graph.model_inspector(), np.array(list(product((-1.0, 1.0), repeat=3))).T
+    lever = 0.0
+    for geometry in plant.GetCollisionGeometriesForBody(workpiece):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        if box is not None:  # None for a half space
+            X_PBox = X_PW @ inspector.GetPoseInFrame(geometry) @ box.pose()
+            points = X_PBox.multiply(corners * box.half_width()[:, None])
+            lever = max(lever, float(np.linalg.norm(points, axis=0).max()))
+    return lever
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from guiderail.diagrams.envs.scene import Camera, look_at
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
+from guiderail.diagrams.stations.workcell import contact_lever
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
@@ -206,7 +207,9 @@ class InsertionTask(Task):
 
     def impedance(self) -> Impedance | None:
         """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
-        return Impedance().with_max_force(self.largest_force_limit) if self.bounded_force else None
+        if not self.bounded_force:
+            return None
+        return Impedance().with_max_force(self.largest_force_limit, contact_lever(self.workcell()))
 
     def exceeds_force_limit(self) -> Callable[..., bool]:
         """Return the condition of a collision: a force above `force_limit` [N], or above a sampled limit."""

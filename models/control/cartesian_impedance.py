@@ -12,7 +12,7 @@ from scipy.linalg import lapack
 
 from guiderail.models.common.arrays import cross
 from guiderail.models.control.damped_inverse import LEVER
-from guiderail.models.control.wrench import WrenchBound, bounded_wrench
+from guiderail.models.control.wrench import MovingInertia, WrenchBound, bounded_wrench
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # added to Λ⁻¹, so that the inertia of a singular arm is finite
 
@@ -141,8 +141,11 @@ def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> Jo
         wrench = _clipped(unlimited_wrench, law.wrench_limits)
         is_limited = bool((np.abs(unlimited_wrench) >= law.wrench_limits).any())
     else:
-        mass = _mass_along(velocity[:3], Lambda_inverse)
-        wrench = bounded_wrench(spring, damping, velocity[:3], mass, bound)
+        inertia = MovingInertia(
+            _inertia_along(velocity[:3], spring[:3], Lambda_inverse[:3, :3]),
+            _inertia_along(velocity[3:], spring[3:], Lambda_inverse[3:, 3:]),
+        )
+        wrench = bounded_wrench(spring, damping, velocity, inertia, bound)
         is_limited = bool(np.abs(wrench - unlimited_wrench).max() > _ROUNDING)
     tool_acceleration = M_inverse_JT.T @ law.posture_torque
     if _is_regular(R_inverse):
@@ -164,10 +167,15 @@ def has_regular_inertia(Lambda_inverse: np.ndarray) -> bool:
     return _is_regular(_root_of_inverse(Lambda_inverse))
 
 
-def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:
-    """Return the effective mass [kg] of the tool, free to rotate, in the direction of its velocity (3,) [m/s]."""
-    square = float(velocity @ velocity)
-    return square / float(velocity @ Lambda_inverse[:3, :3] @ velocity) if square > 0.0 else 0.0
+def _inertia_along(velocity: np.ndarray, spring: np.ndarray, Lambda_inverse: np.ndarray) -> float:
+    """Return the inertia of the tool in the direction of its translational or rotational velocity (3,).
+
+    It is the mass [kg] of the tool, free to rotate, or the moment of inertia [kg m²] of the tool, free to translate.
+    `Lambda_inverse` (3, 3) is the block of this motion. At rest the direction is that of the spring's force or torque.
+    """
+    direction = velocity if velocity.any() else spring
+    square = float(direction @ direction)
+    return square / float(direction @ Lambda_inverse @ direction) if square > 0.0 else 1.0
 
 
 def _is_regular(R_inverse: np.ndarray) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,13 +40,14 @@ class WrenchBound:
     # Largest stiffness of workpiece, grasp and fixture in series for which impacts are inside the bound [N/m], not
     # negative. With 0, the approach speed is not limited.
     contact_stiffness: float = 0.0
+    contact_lever: float = 0.0  # largest distance of a contact from the tool center [m], not negative
 
     def __post_init__(self) -> None:
-        numbers = (*np.ravel(self.axes), self.force, self.torque, self.contact_stiffness)
+        numbers = (*np.ravel(self.axes), self.force, self.torque, self.contact_stiffness, self.contact_lever)
         if np.shape(self.axes) != (6,) or not all(number >= 0.0 for number in numbers):
             raise InputError(
-                "the bound of a wrench is six limits, two norms and a stiffness, none negative, not "
-                f"{self.axes}, {self.force}, {self.torque} and {self.contact_stiffness}"
+                "the bound of a wrench is six limits, two norms, a stiffness and a lever, none negative, not "
+                f"{self.axes}, {self.force}, {self.torque}, {self.contact_stiffness} and {self.contact_lever}"
             )
 
     @property
@@ -105,6 +107,13 @@ def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray
     return target.copy() if excess <= 1.0 else bound + change / excess
 
 
+class MovingInertia(NamedTuple):
+    """Inertia that moves with a tool: a mass [kg] and a moment of inertia [kg m²], both positive."""
+
+    mass: float
+    moment: float
+
+
 def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: float) -> np.ndarray:
     """Clip a wrench (6,) to limits per axis (6,), then scale force and torque to the limits of their norms."""
     clipped = np.minimum(np.maximum(wrench, -axes), axes)
@@ -116,21 +125,43 @@ def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: floa
 
 
 def slow_down(
-    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, impedance: float, force: float
+    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, inertia: MovingInertia, bound: WrenchBound
 ) -> np.ndarray:
-    """Limit a spring's force (3,) [N] to F − (c − d) |v|, so that it accelerates the mass to a speed of at most F / c.
+    """Limit a spring's wrench (6,), so that no point of contact becomes faster than F / c.
 
-    d = vᵀ D v / |v|² is the damping in the direction of motion, and c = 2 √(k m) is the `approach_impedance`. Only a
-    force that does positive work is reduced. No energy is therefore added: while it relaxes, the spring returns at most
-    the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], `impedance` is
-    c [N s/m], and `force` is F [N].
+        |s| ≤ F − (c − d) |v| − c l |ω|,    κ |t| ≤ F − |s| − c |v| − (c l − κ d_ω) |ω|,    κ = l m / I
+
+    s and t are the spring's force and torque, v and ω the tool's velocities, and l is the largest distance of a contact
+    from the tool center. c = 2 √(k m) is the `approach_impedance`. d = vᵀ D v / |v|² is the damping in the direction of
+    motion, and d_ω that of the rotation. A contact has at most the speed |v| + l |ω|, and at most the force |s| + κ |t|
+    accelerates the mass m there. Only a force or torque that does positive work is reduced. No energy is therefore
+    added: while it relaxes, the spring returns at most the energy that it stored.
+
+    Args:
+        spring: Wrench of the spring (6,) [N, Nm].
+        damping: Wrench D v (6,) of the damper [N, Nm].
+        velocity: Translational and rotational velocity (6,) [m/s, rad/s].
+        inertia: Moving mass m and moment of inertia I.
+        bound: Bound of the wrench, with F, the stiffness k of the contact, and l.
     """
-    speed = norm(velocity)
-    if speed == 0.0 or spring.dot(velocity) <= 0.0:
-        return spring
-    limit = max(0.0, force - max(0.0, impedance * speed - float(damping.dot(velocity)) / speed))
-    magnitude = norm(spring)
-    return spring if magnitude <= limit else spring * (limit / magnitude)
+    s, t, v, w = spring[:3], spring[3:], velocity[:3], velocity[3:]
+    impedance, lever = approach_impedance(bound.contact_stiffness, inertia.mass), bound.contact_lever
+    speed, turn = norm(v), norm(w)
+    if s.dot(v) > 0.0:
+        limit = bound.force - max(0.0, impedance * speed - float(damping[:3].dot(v)) / speed) - impedance * lever * turn
+        s = _shortened(s, limit)
+    weight = lever * inertia.mass / inertia.moment
+    if weight > 0.0 and t.dot(w) > 0.0:
+        limit = bound.force - norm(s) - impedance * speed
+        limit -= max(0.0, impedance * lever * turn - weight * float(damping[3:].dot(w)) / turn)
+        t = _shortened(t, limit / weight)
+    return np.concatenate([s, t])
+
+
+def _shortened(vector: np.ndarray, limit: float) -> np.ndarray:
+    """Return the vector (3,) with at most the length `limit`, zero if that is negative."""
+    length = norm(vector)
+    return vector if length <= limit else vector * (max(0.0, limit) / length)
 
 
 def approach_impedance(contact_stiffness: float, mass: float) -> float:
@@ -143,7 +174,7 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
 
 
 def bounded_wrench(
-    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, mass: float, bound: WrenchBound
+    spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, inertia: MovingInertia, bound: WrenchBound
 ) -> np.ndarray:
     """Compute s − β d (6,) of a clipped spring s and a damper d, with the largest β ≤ 1 for which it is in the bound.
 
@@ -153,13 +184,13 @@ def bounded_wrench(
     Args:
         spring: Wrench of the spring (6,) [N, Nm].
         damping: Wrench d of the damper (6,) [N, Nm].
-        velocity: Translational velocity (3,) [m/s].
-        mass: Moving mass in the direction of the velocity [kg].
+        velocity: Translational and rotational velocity (6,) [m/s, rad/s].
+        inertia: Moving mass and moment of inertia in the direction of the velocity.
         bound: Bound, along the axes of the wrenches.
     """
     s = clip_wrench(spring, bound.axes, bound.force, bound.torque)
-    impedance = approach_impedance(bound.contact_stiffness, mass)
-    s[:3] = slow_down(s[:3], damping[:3], velocity, impedance, bound.force)
+    # A force that brakes at its limit leaves no room for the damper, on which the limit of the torque relies.
+    s = slow_down(s, damping_share(s, damping, bound) * damping, velocity, inertia, bound)
     return s - damping_share(s, damping, bound) * damping
 
 
@@ -187,7 +218,7 @@ def governed_error(
     damping: np.ndarray,
     error: np.ndarray,
     velocity: np.ndarray,
-    mass: float,
+    inertia: MovingInertia,
     step: float,
     bound: WrenchBound,
 ) -> np.ndarray:
@@ -195,24 +226,25 @@ def governed_error(
 
     The plant integrates spring and damper implicitly: their force in the step is K e − (K h + D) v₁ with the velocity
     v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound, provided that K e is inside the
-    bound reduced by (K h + D) |v₀|.
+    bound reduced by (K h + D) |v₀|. The torque is at most F I / (c l h), so that a step from rest makes no contact
+    faster than F / c (see `slow_down`).
 
     Args:
         stiffness: Stiffness (6,) K of each coordinate [N/m, Nm/rad], positive.
         damping: Damping (6,) D of each coordinate [N s/m, Nm s/rad].
         error: Pose error (6,) e [m, rad].
         velocity: Velocity (6,) v₀ before the step [m/s, rad/s].
-        mass: Moving mass [kg].
+        inertia: Moving mass and smallest moment of inertia.
         step: Time step h [s].
         bound: Bound, with axes in the order of the coordinates.
     """
     implicit = (stiffness * step + damping) * np.abs(velocity)
     force, torque = norm(implicit[:3]), norm(implicit[3:])
-    spring = clip_wrench(stiffness * error, bound.axes, bound.force, bound.torque)
-    impedance = approach_impedance(bound.contact_stiffness, mass)
-    spring[:3] = slow_down(spring[:3], damping[:3] * velocity[:3], velocity[:3], impedance, bound.force)
+    lever = approach_impedance(bound.contact_stiffness, inertia.mass) * bound.contact_lever * step
+    max_torque = min(bound.torque, bound.force * inertia.moment / lever) if lever > 0.0 else bound.torque
+    spring = clip_wrench(stiffness * error, bound.axes, bound.force, max_torque)
     spring = clip_wrench(
-        spring,
+        slow_down(spring, damping * velocity, velocity, inertia, bound),
         np.maximum(bound.axes - implicit, 0.0),
         max(bound.force - force, 0.0),
         max(bound.torque - torque, 0.0),

@@ -1,12 +1,14 @@
 """Adversarial actions against the force limit: random, held, extreme and bang-bang, and a search over whole episodes.
 
-    python tests/harness/force_adversary.py --steps 100000 --out forces.csv  # an hour on one core; 0 stops are expected
+    python tests/harness/force_adversary.py --steps 100000 --out forces.csv  # ten minutes of one core
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
 
 A case is a task at difficulty=hard, on a station, with a contact of a given stiffness. Each round of a case draws a
-guidance and a range of force limits, on an arm also a payload that its controller does not model, and on the gantry a
-factor of the moving mass. Half of the episodes belong to an evolution strategy, which changes actions or conditions of
-the episode with the largest transient force.
+guidance, a factor of the friction and a range of force limits, on an arm also a payload that its controller does not
+model, and on the gantry a factor of the moving mass. In two of three rounds the guidance is `Anywhere`, which commands
+what a policy behind guidance cannot: any reference in a box around the target, to fall on the rim, or off it and into
+the walls. Half of the episodes belong to an evolution strategy, which changes actions or conditions of the episode with
+the largest transient force.
 
 The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md), relative to the
 limit of the episode plus the weight of the payload. It is printed, and written to `--out`. A run continues from that
@@ -30,22 +32,30 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.stations.station import CONTACT_STIFFNESS
+from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
 from guiderail.models.control.wrench import FORCE_SHARES
+from guiderail.models.laws.law import Command, Law
 
+ANYWHERE = "anywhere"  # registered name of `Anywhere`
 GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
 STATIONS = ("gantry", "arm", "mujoco")
-# Stiffness of the contact with the rim [N/mm], measured on the gantry with pressures of 4.5 and 9 N, and the factor of
-# the contact's modulus that causes it.
+# Stiffness of the contact with the rim [N/mm] that `--measure` prints, and the factor of the contact's modulus for it.
 DRAKE = {
-    "BncConnector": {2460: 1.0, 192: 6.5e-4, 98: 3e-4, 24: 7e-5},
-    "GridClamp": {2300: 1.0, 199: 0.08, 96: 0.035, 29: 7e-3},
+    "BncConnector": {982: 1.0, 199: 5.8e-4, 105: 2.8e-4, 24: 6e-5},
+    "GridClamp": {9160: 1.0, 206: 0.022, 105: 0.011, 25: 2.4e-3},
 }
 CONTACTS = {
     "gantry": DRAKE,
     "arm": DRAKE,
-    "mujoco": {"BncConnector": {3790: 1.0, 187: 7e-4, 90: 2.2e-4}, "GridClamp": {154000: 1.0, 185: 1.1e-3, 99: 3e-4}},
+    "mujoco": {
+        "BncConnector": {1170: 1.0, 166: 7.4e-4, 80: 3.3e-4},
+        "GridClamp": {311000: 1.0, 188: 6e-4, 100: 3.2e-4},
+    },
 }
+RIM = {"BncConnector": 0.004, "GridClamp": 0.005}  # distance from the target at which the workpiece is on the rim [m]
+FRICTION_FACTORS = (0.5, 1.0, 2.0)
+REACH = np.array([0.008, 0.008, 0.025, 0.3, 0.1, 0.1])  # of `Anywhere` from the start [m], [rad]
 ATTACKS = ("random", "constant", "extreme", "bang_bang")
 LIMITS = (8.0, 25.0)  # range of sampled force limits [N]
 PAYLOADS = (0.0, 0.25, 0.5)  # a weight of up to 5 N, the largest that is not refused before a motion [kg]
@@ -106,6 +116,16 @@ def transient_bound(stiffness: float, mass: float, delay: float) -> float:
     return peak + delay * math.sqrt(stiffness / mass)
 
 
+class Anywhere(Law):
+    """Law of a reference anywhere in the box `REACH` around the start; the state is the start."""
+
+    def command(self, start: np.ndarray, action: np.ndarray, pose: np.ndarray, wrench: np.ndarray) -> np.ndarray:
+        return start + REACH * action
+
+    def next(self, start: np.ndarray, command: Command, pose: np.ndarray) -> np.ndarray:
+        return start
+
+
 def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
     """Return a function that returns the next action (size,) of an attack."""
     constant = rng.uniform(-1.0, 1.0, size) if kind == "constant" else rng.choice([-1.0, 1.0], size)
@@ -149,12 +169,13 @@ class Search:
 def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool) -> None:
     """Run attacks for at least `steps` control steps and add them to a case; `searches` are by the guidance."""
     rng = np.random.default_rng([SEED, STATIONS.index(case.station), case.stiffness, case.rounds])
-    guidance = str(rng.choice(GUIDANCE[case.task]))
+    guidance = ANYWHERE if case.rounds % 3 else str(rng.choice(GUIDANCE[case.task]))
     options: dict[str, Any] = {"guidance": guidance, "station": case.station, "difficulty": "hard"}
     if rng.random() < 0.5:
         options["force_limit_range"] = LIMITS
     payload = float(rng.choice(PAYLOADS)) if case.station == "arm" else 0.0
     factor = float(rng.choice(MASS_FACTORS)) if case.station == "gantry" else 1.0
+    friction = float(rng.choice(FRICTION_FACTORS))
     if payload > 0.0:
         options["disturbances"] = {"payload": payload}
     env = make_env(case.task, action_repeat=5, bounded_force=bounded, **options)
@@ -168,7 +189,7 @@ def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool
         else:
             act = attack(ATTACKS[case.episodes // 2 % len(ATTACKS)], rng, size)
         *_, info = env.reset(seed=seed, options={"new_run": True})
-        station.set_contact(env.simulator.get_mutable_context(), 1.0, modulus)
+        station.set_contact(env.simulator.get_mutable_context(), friction, modulus)
         if factor != 1.0:
             scale_mass(env, factor)
         limit = info.get("force_limit", env.diagram.task.collision.above)
@@ -209,19 +230,48 @@ def scale_mass(env: Any, factor: float) -> None:
         body.SetMass(context, factor * body.default_mass())
 
 
+def measured_stiffness(task: str, station: str, modulus: float) -> float:
+    """Return the stiffness of the contact with the rim [N/mm] between pressures of about 4.5 N and the largest one."""
+    difficulty = "hard_6s" if task == "GridClamp" else "hard"
+    env = make_env(task, guidance=ANYWHERE, station=station, difficulty=difficulty, action_repeat=5)
+    env.reset(seed=SEED, options={"new_run": True})
+    station_of(env).set_contact(env.simulator.get_mutable_context(), 1.0, modulus)
+
+    def press(height: float, num_actions: int) -> tuple[float, float]:
+        """Command a height [m] relative to the start; return the measured height and the contact's force along z."""
+        action = np.array([RIM[task], 0.0, height, 0.0, 0.0, 0.0]) / REACH
+        for _ in range(num_actions):
+            env.step(action)
+        return float(env.trace.measured[-1, 2] - env.trace.measured[0, 2]), float(env.trace.signals["wrench"][-1, 2])
+
+    press(0.0, 6)
+    heights = iter(np.arange(0.0, REACH[2], 5e-4))
+    while press(-next(heights), 1)[1] < 0.5:
+        pass
+    height, force = press(-next(heights), 1)
+    points = []
+    for pressure in (4.5, 9.0):
+        for _ in range(2):
+            height, force = press(height - pressure / Impedance().stiffness[2], 8)
+        points.append((height, force))
+    env.close()
+    (first, low), (second, high) = points
+    return 1e-3 * (high - low) / (first - second)
+
+
 def watch_contact(env: Any) -> list[float]:
     """Return a list to which every step of the physics adds the norm of the contact forces [N]."""
     station, forces = station_of(env), [0.0]
     gantry, plant = getattr(station, "gantry", None), station.plant
     if station.plant.time_step() == 0.0:  # MuJoCo
-        inner = type(gantry)._contact_wrench
+        engine, inner = gantry.engine, type(gantry.engine).advance
 
-        def contact_wrench() -> np.ndarray:
-            wrench = inner(gantry)
-            forces.append(float(np.linalg.norm(wrench[:3])))
-            return wrench
+        def advance(*given: Any) -> tuple[np.ndarray, np.ndarray, float]:
+            state, wrenches, step = inner(engine, *given)
+            forces.extend(np.linalg.norm(wrenches[:, :3], axis=1).tolist())
+            return state, wrenches, step
 
-        gantry._contact_wrench = contact_wrench
+        engine.advance = advance
         return forces
     contact = plant.get_contact_results_output_port()
 
@@ -274,7 +324,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
     parser.add_argument("--out", type=Path, help="CSV file of the table, from which a run continues")
+    parser.add_argument("--measure", action="store_true", help="print the stiffness of each contact instead")
     args = parser.parse_args(arguments)
+    register_guidance(ANYWHERE)(Anywhere)
     cases = {(case.task, case.station, case.stiffness): case for case in read(args.out)}
     for station in STATIONS:
         for task, contacts in CONTACTS[station].items():
@@ -282,6 +334,13 @@ def main(arguments: list[str] | None = None) -> int:
                 if args.task in (None, task) and args.station in (None, station):
                     cases.setdefault((task, station, stiffness), Case(task, station, stiffness))
     table = list(cases.values())
+    if args.measure:
+        for case in table:
+            if case.station != "arm":  # the contact is that of the gantry
+                modulus = CONTACTS[case.station][case.task][case.stiffness]
+                stiffness = measured_stiffness(case.task, case.station, modulus)
+                print(f"{case.task}, {case.station}, factor {modulus:g} of the modulus: {stiffness:.0f} N/mm")
+        return 0
     searches: dict[int, dict[str, Search]] = {number: {} for number in range(len(table))}
     steps = min(ROUND, max(args.steps // len(table), 1))
     while (remaining := args.steps - sum(case.control_steps for case in table)) > 0:

@@ -17,7 +17,7 @@ from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.control.command_filters import BarrierFilter, KeepOut
-from guiderail.models.control.wrench import WrenchBound
+from guiderail.models.control.wrench import MovingInertia, WrenchBound
 from guiderail.models.laws import Law, StateProgress
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.templates import load_template
@@ -85,7 +85,9 @@ def system_by_name():
         systems.PoseWrench(),
         systems.ProgressClock(StateProgress((1.0, 1.0), 3), 2, PERIOD),
         systems.Recorder({"u": 2}, 4, PERIOD),
-        systems.ReferenceGovernor(np.ones(6), np.ones(6), 1.0, PERIOD, WrenchBound(np.ones(6), 1.0, 1.0)),
+        systems.ReferenceGovernor(
+            np.ones(6), np.ones(6), MovingInertia(1.0, 1.0), PERIOD, WrenchBound(np.ones(6), 1.0, 1.0)
+        ),
         systems.RelativePoses(plant, [body], other),
         systems.Residual(np.ones(2)),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),

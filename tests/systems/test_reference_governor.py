@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.control.wrench import WrenchBound
+from guiderail.models.control.wrench import MovingInertia, WrenchBound
 from guiderail.systems import ReferenceGovernor
 
 STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]
@@ -13,7 +13,7 @@ ZEROS = np.zeros(6)
 
 def reference_pose(desired, velocity=ZEROS, pose=ZEROS, max_wrench=None):
     """Return the reference pose (6,) of the governor."""
-    system = ReferenceGovernor(STIFFNESS, DAMPING, 1.5, 0.01, BOUND)
+    system = ReferenceGovernor(STIFFNESS, DAMPING, MovingInertia(1.5, 2e-3), 0.01, BOUND)
     context = system.CreateDefaultContext()
     system.get_desired_pose_input_port().FixValue(context, desired)
     system.get_state_input_port().FixValue(context, np.r_[pose, velocity])

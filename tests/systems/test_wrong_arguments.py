@@ -80,7 +80,13 @@ KEEP_OUT = KeepOut([[0.5, 2.0]], [[9.0, 3.0]], LinearConstraints.none(2), margin
 BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 2.5e4)
 OPENING = {"lower": np.array([0.0, -1.0]), "upper": np.array([0.04, 1.0]), "opening": np.array([0.03, 0.5])}
 EIGHT = {"bound": np.zeros(8), "max_rate": np.full(8, 1e-3), "period": PERIOD}
-GOVERNOR = {"stiffness": np.full(6, 30.0), "damping": np.full(6, 0.5), "mass": 0.01, "step": PERIOD, "bound": BOUND}
+GOVERNOR = {
+    "stiffness": np.full(6, 30.0),
+    "damping": np.full(6, 0.5),
+    "inertia": (0.01, 1e-4),
+    "step": PERIOD,
+    "bound": BOUND,
+}
 TANK = {"stiffness": np.ones(6), "damping": np.ones(6), "bound": BOUND, "capacity": 1.0, "period": PERIOD}
 FREE_GAINS = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
 # Valid arguments of a constructor, and values out of range of single arguments with a word of the error.
@@ -110,7 +116,7 @@ OUT_OF_RANGE = [
     (systems.ReferenceGovernor, GOVERNOR, "damping", (np.full(5, 1.0),), "six positive stiffnesses"),
     (systems.ReferenceGovernor, GOVERNOR, "stiffness", (np.full(6, np.inf),), "all finite"),
     (systems.ReferenceGovernor, GOVERNOR, "damping", (np.full(6, np.inf),), "all finite"),
-    (systems.ReferenceGovernor, GOVERNOR, "mass", (0.0, np.inf, np.nan), "moving mass must be positive"),
+    (systems.ReferenceGovernor, GOVERNOR, "inertia", ((0.0, 1.0), (1.0, np.inf), (np.nan, 1.0)), "must be positive"),
     (systems.ReferenceGovernor, GOVERNOR, "step", (0.0,), "period must be positive"),
     (
         StateProgress,

@@ -18,7 +18,7 @@ from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, pose_to_transform, rpy_rotation, transform_to_pose
-from guiderail.models.control.wrench import WrenchBound, bounded_wrench, governed_error
+from guiderail.models.control.wrench import MovingInertia, WrenchBound, bounded_wrench, governed_error
 from guiderail.models.laws.law import Command, Law, safe_command
 from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.policy import Policy
@@ -267,8 +267,11 @@ def policy(steps: int) -> Files:
 
 STIFFNESS = np.array([1500.0, 1200.0, 1500.0, 30.0, 20.0, 30.0])
 DAMPING = np.array([90.0, 80.0, 100.0, 0.5, 0.4, 0.5])
-BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 3.0, 2.0, 3.0]), 19.0, 4.0, 2.5e4)
-GOVERNOR = governor_arrays(STIFFNESS, DAMPING, np.append(BOUND.numbers, BOUND.contact_stiffness), 1.5, 0.005)
+BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 3.0, 2.0, 3.0]), 19.0, 4.0, 2.5e4, 0.03)
+INERTIA = MovingInertia(1.5, 2e-3)
+GOVERNOR = governor_arrays(
+    STIFFNESS, DAMPING, np.append(BOUND.numbers, [BOUND.contact_stiffness, BOUND.contact_lever]), INERTIA, 0.005
+)
 
 
 def governor(steps: int) -> Files:
@@ -279,7 +282,7 @@ def governor(steps: int) -> Files:
     max_wrench = np.where(rng.uniform(size=(steps, 8)) < 0.1, np.nan, 25.0 * rng.uniform(-0.1, 1.0, (steps, 8)))
     reference = [
         pose[t] + governed_error(
-            STIFFNESS, DAMPING, desired[t] - pose[t], velocity[t], 1.5, 0.005,
+            STIFFNESS, DAMPING, desired[t] - pose[t], velocity[t], INERTIA, 0.005,
             BOUND.lowered_to(max_wrench[t]).in_pose_order,
         )
         for t in range(steps)
@@ -294,10 +297,13 @@ def governor(steps: int) -> Files:
 def force_bound(steps: int) -> Files:
     rng = np.random.default_rng(5)
     spring, damper = 12.0 * rng.normal(size=(2, steps, 6))
-    velocity, mass = 0.1 * rng.normal(size=(steps, 3)), rng.uniform(1.0, 10.0, steps)
-    wrench = [bounded_wrench(spring[t], damper[t], velocity[t], mass[t], BOUND) for t in range(steps)]
+    velocity = 0.1 * rng.normal(size=(steps, 6))
+    inertia = np.column_stack([rng.uniform(1.0, 10.0, steps), rng.uniform(0.002, 0.1, steps)])
+    wrench = [
+        bounded_wrench(spring[t], damper[t], velocity[t], MovingInertia(*inertia[t]), BOUND) for t in range(steps)
+    ]
     recording = {
-        "reset": np.zeros(steps), "spring": spring, "damper": damper, "velocity": velocity, "mass": mass,
+        "reset": np.zeros(steps), "spring": spring, "damper": damper, "velocity": velocity, "inertia": inertia,
         "wrench": wrench,
     }  # fmt: skip
     return _files(GOVERNOR, recording)

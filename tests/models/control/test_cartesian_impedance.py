@@ -18,7 +18,7 @@ from guiderail.models.control.cartesian_impedance import (
     reachable_inertia,
     spring_wrench,
 )
-from guiderail.models.control.wrench import WrenchBound, bounded_wrench
+from guiderail.models.control.wrench import MovingInertia, WrenchBound, bounded_wrench
 
 SEEDS = st.integers(0, 2**32 - 1)
 UNLIMITED = np.full(6, 1e9)
@@ -147,7 +147,7 @@ def test_torques_are_clipped_to_the_motor_limits(seed, share):
     assert result.is_saturated == bool((np.abs(unlimited.torque) > limits).any())
 
 
-STIFF = {"contact_stiffness": 2.5e4}
+STIFF = {"contact_stiffness": 2.5e4, "contact_lever": 0.05}
 BOUNDS = {
     "wide": WrenchBound(np.full(6, 1e6), 1e6, 1e6),
     "narrow": WrenchBound(np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6]), 6.0, 0.7),
@@ -163,8 +163,8 @@ def test_bound_limits_spring_and_damper_along_the_axes(name, seed):
     V, K = arguments["J"] @ arguments["v"], arguments["K"]
     spring = spring_wrench(K, arguments["p_error"], arguments["eta"], arguments["epsilon"])
     damping = damping_matrix(K, Lambda_inverse, 0.7) @ V
-    mass = (V[:3] @ V[:3]) / (V[:3] @ Lambda_inverse[:3, :3] @ V[:3])
-    expected = bounded_wrench(spring, damping, V[:3], mass, bound)
+    along = [(V[i] @ V[i]) / (V[i] @ Lambda_inverse[i, i] @ V[i]) for i in (slice(0, 3), slice(3, 6))]
+    expected = bounded_wrench(spring, damping, V, MovingInertia(*along), bound)
     result = torques(**arguments | {"bound": bound})
     np.testing.assert_allclose(result.wrench, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     assert result.is_saturated == (np.abs(expected - (spring - damping)).max() > 1e-6)

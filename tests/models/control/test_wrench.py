@@ -8,6 +8,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import (
+    MovingInertia,
     WrenchBound,
     admissible_change,
     approach_bound,
@@ -21,8 +22,8 @@ from guiderail.models.control.wrench import (
 )
 
 AXES = np.array([9.0, 9.0, 15.0, 3.0, 3.0, 3.0])
-BOUND = WrenchBound(AXES, 18.0, 4.0, 2.5e4)
-K, D, MASS = 1500.0, 95.0, 1.5
+BOUND = WrenchBound(AXES, 18.0, 4.0, 2.5e4, 0.03)
+K, D, INERTIA = 1500.0, 95.0, MovingInertia(1.5, 2e-3)
 
 
 def is_inside(wrench, bound=BOUND, tolerance=1e-9):
@@ -34,14 +35,15 @@ def is_inside(wrench, bound=BOUND, tolerance=1e-9):
 def test_wrench_is_inside_the_bound_for_any_input():
     rng = np.random.default_rng(0)
     for _ in range(3000):
-        spring, damping, velocity = (10.0 ** rng.uniform(-2, 3) * rng.normal(size=size) for size in (6, 6, 3))
-        assert is_inside(bounded_wrench(spring, damping, velocity, rng.uniform(0.5, 20.0), BOUND))
+        spring, damping, velocity = (10.0 ** rng.uniform(-2, 3) * rng.normal(size=6) for _ in range(3))
+        inertia = MovingInertia(rng.uniform(0.5, 20.0), rng.uniform(0.001, 0.1))
+        assert is_inside(bounded_wrench(spring, damping, velocity, inertia, BOUND))
 
 
 def test_law_is_spring_and_damper_at_small_wrenches():
-    spring, velocity = np.array([2.0, -1.0, 3.0, 0.1, 0.2, -0.1]), np.array([0.004, 0.0, -0.003])
-    damping = np.r_[D * velocity, 0.0, 0.0, 0.0]
-    np.testing.assert_allclose(bounded_wrench(spring, damping, velocity, MASS, BOUND), spring - damping, atol=1e-12)
+    spring, velocity = np.array([2.0, -1.0, 3.0, 0.1, 0.2, -0.1]), np.array([0.004, 0.0, -0.003, 0.02, 0.0, 0.0])
+    damping = np.r_[D * velocity[:3], 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(bounded_wrench(spring, damping, velocity, INERTIA, BOUND), spring - damping, atol=1e-12)
 
 
 def test_damping_share_is_the_largest_inside_the_bound():
@@ -67,8 +69,9 @@ def test_impact_stays_inside_the_bound(axis, mass):
     damping, impedance = 2.0 * np.sqrt(K * mass), approach_impedance(bound.contact_stiffness, mass)
 
     def accelerated(speed, contact, step):
-        velocity = np.array([speed, 0.0, 0.0])
-        wrench = bounded_wrench(np.r_[100.0, np.zeros(5)], np.r_[damping * velocity, 0, 0, 0], velocity, mass, bound)
+        velocity = np.r_[speed, np.zeros(5)]
+        inertia = MovingInertia(mass, 2e-3)
+        wrench = bounded_wrench(np.r_[100.0, np.zeros(5)], damping * velocity, velocity, inertia, bound)
         return speed + step * (wrench[0] - contact) / mass
 
     speed, depth, depths = 0.0, 0.0, []
@@ -80,10 +83,56 @@ def test_impact_stays_inside_the_bound(axis, mass):
         depth += 5e-5 * speed
         depths.append(depth)
     assert 0.9 * axis < bound.contact_stiffness * max(depths) <= bound.force
-    free = bounded_wrench(
-        np.r_[100.0, np.zeros(5)], np.zeros(6), np.array([1.0, 0, 0]), mass, WrenchBound(AXES, 18.0, 4.0)
-    )
-    assert free[0] == AXES[0]  # without a contact stiffness the speed is not limited
+    unlimited = WrenchBound(AXES, 18.0, 4.0)
+    free = bounded_wrench(np.full(6, 100.0), np.zeros(6), np.ones(6), INERTIA, unlimited)
+    np.testing.assert_allclose(free, clip_wrench(np.full(6, 100.0), AXES, 18.0, 4.0))  # without a contact stiffness
+
+
+def turning_tool(bound, inertia, rng, distance, lever=0.03, steps=4_000, step=1e-4):
+    """Simulate a plane tool on a distant reference that switches; return its speeds and the forces of a contact.
+
+    The tool moves along y and turns about x. A point at the distance l on its side touches a wall of the bound's
+    stiffness `distance` ahead. The result has a row for each step: the largest speed |v| + l |ω| of a point, and the contact's
+    force.
+    """
+    damping, D_turn = 2.0 * np.sqrt(K * inertia.mass), 2.0 * np.sqrt(30.0 * inertia.moment)
+    y, turn, v, w, rows = 0.0, 0.0, 0.0, 0.0, []
+    for number in range(steps):
+        if number % 400 == 0:
+            push, torque = rng.choice([-100.0, 0.0, 100.0, 100.0]), rng.choice([-10.0, 10.0])
+        depth = max(0.0, y + lever * turn - distance)
+        velocity = np.array([0.0, v, 0.0, w, 0.0, 0.0])
+        damper = np.array([0.0, damping * v, 0.0, D_turn * w, 0.0, 0.0])
+        wrench = bounded_wrench(np.array([0.0, push, 0.0, torque, 0.0, 0.0]), damper, velocity, inertia, bound)
+        contact = bound.contact_stiffness * depth
+        v += step * (wrench[1] - contact) / inertia.mass
+        w += step * (wrench[3] - contact * lever) / inertia.moment
+        y, turn = y + step * v, turn + step * w
+        rows.append((abs(v) + lever * abs(w), contact))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("inertia", [INERTIA, MovingInertia(8.0, 0.08)])
+def test_contact_of_a_turning_tool_stays_inside_the_bound(inertia):
+    """At the limit of the speed of its contacts, a tool that pushes and turns hits a wall with at most the force F."""
+    bound, rng = replace(BOUND, axes=np.full(6, 18.0), torque=0.3), np.random.default_rng(4)
+    fastest = bound.force / approach_impedance(bound.contact_stiffness, inertia.mass)
+    speeds, forces = [], []
+    for _ in range(4):
+        speeds.append(turning_tool(bound, inertia, rng, np.inf)[:, 0].max())
+        forces.append(turning_tool(bound, inertia, rng, rng.uniform(0.0, 5e-4))[:, 1].max())
+    assert 0.9 * fastest < max(speeds) <= 1.02 * fastest
+    assert 0.6 * bound.force < max(forces) <= 1.02 * bound.force
+    center_only = turning_tool(replace(bound, contact_lever=0.0), inertia, rng, np.inf)
+    assert center_only[:, 0].max() > 1.1 * fastest
+
+
+def test_torque_that_brakes_is_not_reduced():
+    velocity = np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
+    braking = bounded_wrench(np.r_[0.0, 0.0, 0.0, -3.0, 0.0, 0.0], np.zeros(6), velocity, INERTIA, BOUND)
+    assert braking[3] == -3.0
+    turning = bounded_wrench(np.r_[0.0, 0.0, 0.0, 3.0, 0.0, 0.0], np.zeros(6), velocity, INERTIA, BOUND)
+    assert turning[3] == 0.0  # 60 mm/s at the lever are too fast
 
 
 def test_closed_paths_gain_no_energy_at_a_fixed_reference():
@@ -94,10 +143,11 @@ def test_closed_paths_gain_no_energy_at_a_fixed_reference():
         corners = np.vstack([np.zeros(3), rng.normal(scale=0.02, size=(4, 3)), np.zeros(3)])
         energy = 0.0
         for start, end in itertools.pairwise(corners):
-            velocity = (end - start) / np.linalg.norm(end - start) * 10.0 ** rng.uniform(-3, 0)
+            velocity = np.r_[(end - start) / np.linalg.norm(end - start) * 10.0 ** rng.uniform(-3, 0), np.zeros(3)]
             points = np.linspace(start, end, 400)
             for point in 0.5 * (points[1:] + points[:-1]):
-                wrench = bounded_wrench(np.r_[-K * point, 0, 0, 0], np.r_[D * velocity, 0, 0, 0], velocity, MASS, bound)
+                spring = np.r_[-K * point, 0.0, 0.0, 0.0]
+                wrench = bounded_wrench(spring, D * velocity, velocity, INERTIA, bound)
                 energy += float(wrench[:3] @ (end - start)) / 399.0
         assert energy <= 1e-5
 
@@ -115,7 +165,7 @@ def test_pose_order_reverses_the_limits_of_the_torque():
 def test_lowered_bound_is_never_above_the_original():
     lower = BOUND.lowered_to(np.array([20.0, 5.0, np.nan, -1.0, 1.0, np.inf, 8.0, 0.5]))
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
-    assert lower.contact_stiffness == BOUND.contact_stiffness
+    assert (lower.contact_stiffness, lower.contact_lever) == (BOUND.contact_stiffness, BOUND.contact_lever)
     np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
 
 
@@ -142,7 +192,7 @@ def test_approach_refuses_bounds_that_are_not_finite(value):
 
 @pytest.mark.parametrize("numbers", [(AXES[:5], 1.0, 1.0), (-AXES, 1.0, 1.0), (AXES, np.nan, 1.0), (AXES, 1.0, -1.0)])
 def test_bound_raises_when_a_number_is_invalid(numbers):
-    with pytest.raises(InputError, match="six limits, two norms and a stiffness"):
+    with pytest.raises(InputError, match="six limits, two norms, a stiffness and a lever"):
         WrenchBound(*numbers)
 
 
@@ -152,7 +202,7 @@ def test_governed_error_leaves_room_for_an_implicit_damper():
     stiffness, damping = np.r_[np.full(3, K), np.full(3, 30.0)], np.r_[np.full(3, D), np.full(3, 0.5)]
     for _ in range(2000):
         error, velocity = rng.normal(size=6) * 10.0 ** rng.uniform(-4, 0), rng.normal(size=6) * 0.03
-        governed = governed_error(stiffness, damping, error, velocity, MASS, step, BOUND)
+        governed = governed_error(stiffness, damping, error, velocity, INERTIA, step, BOUND)
         implicit = (stiffness * step + damping) * velocity
         spring = stiffness * governed
         for after in (implicit, -implicit, 0.0 * implicit, rng.uniform(-1, 1, 6) * implicit):
@@ -161,8 +211,15 @@ def test_governed_error_leaves_room_for_an_implicit_damper():
             torque = max(BOUND.torque, np.linalg.norm(implicit[3:]))
             assert is_inside(spring - after, WrenchBound(bounds, force, torque))
     np.testing.assert_allclose(
-        governed_error(stiffness, damping, np.full(6, 1e-3), np.zeros(6), MASS, step, BOUND), 1e-3, atol=1e-15
+        governed_error(stiffness, damping, np.full(6, 1e-3), np.zeros(6), INERTIA, step, BOUND), 1e-3, atol=1e-15
     )
+
+
+def test_governed_torque_makes_no_contact_too_fast_within_a_step_from_rest():
+    stiffness, step = np.r_[np.full(3, K), np.full(3, 30.0)], 0.005
+    error = governed_error(stiffness, np.ones(6), np.full(6, 1.0), np.zeros(6), INERTIA, step, BOUND)
+    speed = BOUND.contact_lever * step * np.linalg.norm(stiffness[3:] * error[3:]) / INERTIA.moment
+    assert speed == pytest.approx(BOUND.force / approach_impedance(BOUND.contact_stiffness, INERTIA.mass))
 
 
 STIFFNESS, SPRING_LIMITS = np.array([1500.0, 30.0]), np.array([15.0, 3.0])

@@ -18,6 +18,7 @@ from guiderail.diagrams.stations.impedance_control import (
     WRENCH_RATE,
 )
 from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
+from guiderail.models.control.wrench import MovingInertia
 from guiderail.models.laws.primitive import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
@@ -107,8 +108,9 @@ def _force_arrays(skill: TrainedSkill) -> Arrays:
     arrays = governor_arrays(
         stiffness,
         2.0 * impedance.damping_ratio * np.sqrt(stiffness * mass),
-        np.append(impedance.bound.numbers, impedance.bound.contact_stiffness),
-        MIN_MASS,
+        # A lever of 0: the rotation is not limited, because the robot's moment of inertia is not known here.
+        np.append(impedance.bound.numbers, [impedance.bound.contact_stiffness, 0.0]),
+        MovingInertia(MIN_MASS, MIN_INERTIA),
         skill.prior.period,
     )
     if skill.prior.template is not None:
@@ -120,11 +122,16 @@ def _force_arrays(skill: TrainedSkill) -> Arrays:
     return arrays
 
 
-def governor_arrays(stiffness: np.ndarray, damping: np.ndarray, bound: np.ndarray, mass: float, step: float) -> Arrays:
-    """Return the arrays of a reference governor; `bound` (9,) has six limits, two norms and the contact stiffness."""
+def governor_arrays(
+    stiffness: np.ndarray, damping: np.ndarray, bound: np.ndarray, inertia: MovingInertia, step: float
+) -> Arrays:
+    """Return the arrays of a reference governor; `bound` (10,) has six limits, two norms, and a contact's stiffness and
+    lever.
+    """
     return {
         "governor/stiffness": stiffness, "governor/damping": damping, "governor/bound": bound,
-        "governor/mass": np.array([mass]), "governor/step": np.array([step]),
+        "governor/mass": np.array([inertia.mass]), "governor/moment": np.array([inertia.moment]),
+        "governor/step": np.array([step]),
     }  # fmt: skip
 
 

@@ -168,8 +168,8 @@ int replay_wrench(const Data& data, Replay& replay) {
     Vec6 spring, damping, wrench;
     std::copy_n(replay.row("spring", t), 6, spring.begin());
     std::copy_n(replay.row("damper", t), 6, damping.begin());
-    const double *velocity = replay.row("velocity", t), *mass = replay.row("mass", t);
-    const double time = replay.timed([&] { wrench = bounded_wrench(spring, damping, velocity, *mass, governor.bound()); });
+    const double *velocity = replay.row("velocity", t), *inertia = replay.row("inertia", t);
+    const double time = replay.timed([&] { wrench = bounded_wrench(spring, damping, velocity, {inertia[0], inertia[1]}, governor.bound()); });
     replay.compare("wrench", t, wrench.data());
     Vec6 free;
     for (int i = 0; i < 6; ++i) free[i] = spring[i] - damping[i];

@@ -21,10 +21,11 @@ inline double norm_of(const double* v, int n = 3) {
 }
 inline double product_of(const double* a, const double* b) { return std::fma(a[2], b[2], std::fma(a[1], b[1], a[0] * b[0])); }
 
-// Limits per axis and of the norms of force and torque [N, Nm], and the stiffness of the contact [N/m].
+// Limits per axis and of the norms of force and torque [N, Nm], the stiffness of the contact [N/m], and its largest
+// distance from the tool center [m].
 struct WrenchBound {
   Vec6 axes{};
-  double force = 0, torque = 0, contact_stiffness = 0;
+  double force = 0, torque = 0, contact_stiffness = 0, contact_lever = 0;
 
   // Element-wise minimum of this bound and limits (8,) that arrive at run time; negative and NaN entries count as 0.
   WrenchBound lowered_to(const double* max_wrench) const {
@@ -60,17 +61,34 @@ inline Vec6 clip_wrench(const Vec6& wrench, const Vec6& axes, double force, doub
   return clipped;
 }
 
-// Limits a spring's force so that it accelerates the mass to a speed of at most force / impedance.
-inline void slow_down(double* spring, const double* damping, const double* velocity, double impedance, double force) {
-  const double speed = norm_of(velocity);
-  if (speed == 0.0 || product_of(spring, velocity) <= 0.0) return;
-  const double limit = std::max(0.0, force - std::max(0.0, impedance * speed - product_of(damping, velocity) / speed));
-  const double magnitude = norm_of(spring);
-  if (!(magnitude <= limit))
-    for (int i = 0; i < 3; ++i) spring[i] *= limit / magnitude;
+inline double approach_impedance(double contact_stiffness, double mass) { return 2.0 * std::sqrt(contact_stiffness * mass); }
+
+// Inertia that moves with a tool: a mass [kg] and a moment of inertia [kg m²].
+struct MovingInertia {
+  double mass = 1, moment = 1;
+};
+
+// Shortens a vector to at most the length `limit`, to zero if that is negative.
+inline void shorten(double* vector, double limit) {
+  const double length = norm_of(vector);
+  if (!(length <= limit))
+    for (int i = 0; i < 3; ++i) vector[i] *= std::max(0.0, limit) / length;
 }
 
-inline double approach_impedance(double contact_stiffness, double mass) { return 2.0 * std::sqrt(contact_stiffness * mass); }
+// Limits a spring's wrench so that no contact becomes faster than force / approach impedance.
+inline void slow_down(Vec6& spring, const Vec6& damping, const double* velocity, const MovingInertia& inertia, const WrenchBound& bound) {
+  double *s = spring.data(), *t = s + 3;
+  const double *d = damping.data(), *w = velocity + 3;
+  const double impedance = approach_impedance(bound.contact_stiffness, inertia.mass), lever = bound.contact_lever;
+  const double speed = norm_of(velocity), turn = norm_of(w);
+  if (product_of(s, velocity) > 0.0)
+    shorten(s, bound.force - std::max(0.0, impedance * speed - product_of(d, velocity) / speed) - impedance * lever * turn);
+  const double weight = lever * inertia.mass / inertia.moment;
+  if (weight > 0.0 && product_of(t, w) > 0.0) {
+    const double limit = bound.force - norm_of(s) - impedance * speed;
+    shorten(t, (limit - std::max(0.0, impedance * lever * turn - weight * product_of(d + 3, w) / turn)) / weight);
+  }
+}
 
 // Largest β in [0, 1] with s − β d inside the bound, for a spring s inside and a damper d.
 inline double damping_share(const Vec6& spring, const Vec6& damping, const WrenchBound& bound) {
@@ -98,9 +116,12 @@ inline double damping_share(const Vec6& spring, const Vec6& damping, const Wrenc
 }
 
 // Wrench s − β d of a spring and a damper with the largest β ≤ 1 for which it is inside the bound.
-inline Vec6 bounded_wrench(const Vec6& spring, const Vec6& damping, const double* velocity, double mass, const WrenchBound& bound) {
+inline Vec6 bounded_wrench(const Vec6& spring, const Vec6& damping, const double* velocity, const MovingInertia& inertia, const WrenchBound& bound) {
   Vec6 s = clip_wrench(spring, bound.axes, bound.force, bound.torque);
-  slow_down(s.data(), damping.data(), velocity, approach_impedance(bound.contact_stiffness, mass), bound.force);
+  Vec6 damper = damping;
+  const double before = damping_share(s, damping, bound);
+  for (double& value : damper) value *= before;
+  slow_down(s, damper, velocity, inertia, bound);
   const double share = damping_share(s, damping, bound);
   for (int i = 0; i < 6; ++i) s[i] = s[i] - share * damping[i];
   return s;
@@ -116,7 +137,9 @@ class Governor {
     std::copy_n(D.values.begin(), 6, damping_.begin());
     std::copy_n(b.values.begin(), 6, bound_.axes.begin());
     bound_.force = b.values.at(6), bound_.torque = b.values.at(7), bound_.contact_stiffness = b.values.at(8);
-    mass_ = data.number(prefix + "mass"), step_ = data.number(prefix + "step");
+    bound_.contact_lever = b.values.at(9);
+    inertia_.mass = data.number(prefix + "mass"), inertia_.moment = data.number(prefix + "moment");
+    step_ = data.number(prefix + "step");
   }
 
   const WrenchBound& bound() const { return bound_; }
@@ -132,8 +155,11 @@ class Governor {
       damper[i] = damping_[i] * velocity[i];
       limits[i] = std::max(bound.axes[i] - implicit[i], 0.0);
     }
-    spring = clip_wrench(spring, bound.axes, bound.force, bound.torque);
-    slow_down(spring.data(), damper.data(), velocity, approach_impedance(bound.contact_stiffness, mass_), bound.force);
+    // A step from rest makes no contact faster than force / approach impedance.
+    const double lever = approach_impedance(bound.contact_stiffness, inertia_.mass) * bound.contact_lever * step_;
+    const double torque = lever > 0.0 ? std::min(bound.torque, bound.force * inertia_.moment / lever) : bound.torque;
+    spring = clip_wrench(spring, bound.axes, bound.force, torque);
+    slow_down(spring, damper, velocity, inertia_, bound);
     spring = clip_wrench(spring, limits, std::max(bound.force - norm_of(implicit.data()), 0.0),
                          std::max(bound.torque - norm_of(implicit.data() + 3), 0.0));
     for (int i = 0; i < 6; ++i) reference[i] = pose[i] + spring[i] / stiffness_[i];
@@ -142,7 +168,8 @@ class Governor {
  private:
   Vec6 stiffness_{}, damping_{};
   WrenchBound bound_;
-  double mass_ = 0, step_ = 0;
+  MovingInertia inertia_;
+  double step_ = 0;
 };
 
 // Wrench limit (8,) of a template's present state, with a bounded rate of change after a transition.
