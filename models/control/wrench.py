@@ -173,6 +173,19 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
     return 2.0 * math.sqrt(contact_stiffness * mass)
 
 
+def impact_ratio(stiffness_ratio: float) -> float:
+    """Return the peak force of an impact relative to the limit F, at the speed F / c that `slow_down` admits.
+
+    It is the first maximum of k_c x for m x'' + c x' + k_c x = F with x'(0) = F / c. `stiffness_ratio` is k_c / k, the
+    stiffness of the contact relative to the assumed one. The result is 1 up to 1, and 1.07, 1.30, 1.68 at 2, 4 and 8.
+    """
+    if stiffness_ratio <= 1.0:
+        return 1.0
+    root = math.sqrt(stiffness_ratio)
+    phase = (math.pi - math.acos(1.0 / root)) / math.sqrt(stiffness_ratio - 1.0)
+    return 1.0 + 0.5 * root * math.exp(-phase)
+
+
 def bounded_wrench(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, inertia: MovingInertia, bound: WrenchBound
 ) -> np.ndarray:

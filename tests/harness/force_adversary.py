@@ -34,7 +34,7 @@ from pydrake.systems.framework import Context, EventStatus
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
-from guiderail.models.control.wrench import FORCE_SHARES
+from guiderail.models.control.wrench import FORCE_SHARES, impact_ratio
 from guiderail.models.laws.law import Command, Law
 
 ANYWHERE = "anywhere"  # registered name of `Anywhere`
@@ -109,11 +109,7 @@ def transient_bound(stiffness: float, mass: float, delay: float) -> float:
         mass: Moving mass [kg].
         delay: Period of the controller, 0 if spring and damper are solved with the contact [s].
     """
-    ratio, peak = stiffness / CONTACT_STIFFNESS, 1.0
-    if ratio > 1.0:
-        phase = (math.pi - math.acos(1.0 / math.sqrt(ratio))) / math.sqrt(ratio - 1.0)
-        peak += 0.5 * math.sqrt(ratio) * math.exp(-phase)
-    return peak + delay * math.sqrt(stiffness / mass)
+    return impact_ratio(stiffness / CONTACT_STIFFNESS) + delay * math.sqrt(stiffness / mass)
 
 
 class Anywhere(Law):

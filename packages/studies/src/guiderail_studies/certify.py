@@ -21,6 +21,7 @@ from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.control.wrench import impact_ratio
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
@@ -84,7 +85,7 @@ def certify_skill(
         worst = _search_budget(loop)
         budget = Budget(BUDGET_MARGIN * worst.excess + np.array(MIN_EXCESS), BUDGET_MARGIN * worst.residue)
     certified = certify(loop, budget)
-    files = certificate_files(loop, certified, skill.stiffness, skill.limits, skill.about, signing_key)
+    files = certificate_files(loop, certified, *skill.impedance, skill.about, signing_key)
     for name, content in files.items():
         write_atomically(out / name, content)
     start_time = time.perf_counter()
@@ -103,8 +104,12 @@ def certify_skill(
         regimes["budgeted"] = certified.budgeted.bounds
     for regime, bounds in regimes.items():
         result |= {f"{regime}_{name}": value for name, value in _extremes(bounds).items()}
-    if skill.limits is not None:
-        result["force"] = float(np.linalg.norm(skill.limits[:3]))
+    _, limits, contact = skill.impedance
+    if limits is not None:
+        result["force"] = force = float(np.linalg.norm(limits[:3]))
+        if contact:
+            names = {ratio: f"impact_at_{ratio * contact / 1e3:.0f}_N_per_mm" for ratio in checker.STIFFNESS_RATIOS}
+            result |= {name: force * impact_ratio(ratio) for ratio, name in names.items()}
     if attack:
         result |= _attack(loop, certified, attack, out)
     return result
@@ -144,7 +149,7 @@ def verify_certificate(
     verdict = _run_checker(folder, key)
     if verdict == "yes":
         files = {name: (folder / name).read_bytes() for name in (CERTIFICATE, *checker.ARRAYS)}
-        different = compare_subject(files, skill.loop, skill.stiffness, skill.limits, skill.about)
+        different = compare_subject(files, skill.loop, *skill.impedance, skill.about)
         if different is not None:
             if different == "about":
                 different = _different_option(json.loads(files[CERTIFICATE])["about"], skill.about)
@@ -162,8 +167,9 @@ class _Skill:
     """Subject of a certificate."""
 
     loop: CertifiedLoop  # primitive in its feedback loop
-    stiffness: np.ndarray | None  # stiffness of the impedance, or None
-    limits: np.ndarray | None  # limits of the impedance's wrench, or None
+    # Stiffness of the impedance and limits of its wrench, or None and None; stiffness of the contact [N/m] for which it
+    # limits the approach speed, or 0.
+    impedance: tuple[np.ndarray | None, np.ndarray | None, float]
     about: dict[str, Any]  # description of the run or task, stored in the certificate
 
 
@@ -182,9 +188,10 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     if impedance is None and loop.primitive.num_outputs == len(Impedance().stiffness):
         impedance = Impedance()
     if impedance is None:
-        return _Skill(loop, None, None, about)
+        return _Skill(loop, (None, None, 0.0), about)
     stiffness = options.get("disturbances.stiffness_factor", 1.0) * np.array(impedance.stiffness)
-    return _Skill(loop, stiffness, np.array(impedance.limits), about)
+    contact_stiffness = 0.0 if impedance.bound is None else impedance.bound.contact_stiffness
+    return _Skill(loop, (stiffness, np.array(impedance.limits), contact_stiffness), about)
 
 
 def _search_budget(loop: CertifiedLoop) -> AttackResult:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import impact_ratio
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 from guiderail_studies.certificate import checker
@@ -195,7 +196,7 @@ def test_any_multipliers_prove_a_bound():
             assert (attack.upper[n] <= highest + 1e-9).all(), change
 
 
-IMPEDANCE = np.array([1500.0, 1500.0]), np.array([40.0, 40.0])
+IMPEDANCE = np.array([1500.0, 1500.0]), np.array([40.0, 40.0]), 2.5e4
 ABOUT = {"task": "none", "environment": {"guidance": "kgrl"}}
 KEY = bytes(range(32))
 
@@ -317,6 +318,18 @@ def change_text(contents, before, after):
     return {**contents, CERTIFICATE: contents[CERTIFICATE].replace(before, after, 1)}
 
 
+def test_impacts_are_the_first_maxima_of_a_pushed_mass():
+    """Integration of m x'' + 2 √(k m) x' + r k x = F, hit at F / (2 √(k m)), with m = k = F = 1."""
+    for ratio, peak in zip(checker.STIFFNESS_RATIOS, IMPACTS, strict=True):
+        depth, speed, largest = 0.0, 0.5, 0.0
+        for _ in range(40_000):
+            speed += 2e-4 * (1.0 - 2.0 * speed - ratio * depth)
+            depth += 2e-4 * speed
+            largest = max(largest, ratio * depth)
+        assert peak == pytest.approx(largest, abs=2e-3)
+        assert checker.peak(ratio) == pytest.approx(peak, rel=1e-12)
+
+
 def make_every_step_active(contents):
     """Return a certificate that calls every step active, with multipliers of zero at the added steps."""
     with np.load(io.BytesIO(contents["witness.npz"])) as witness:
@@ -327,10 +340,21 @@ def make_every_step_active(contents):
 
 
 def limit_forces_to_1_n(impedance):
-    return {**impedance, "limits": [1.0, 1.0], "force": 2**0.5, "rest_force": {"always": 2**0.5}}
+    impacts = [2**0.5 * (1 + 1e-5) * peak for peak in IMPACTS]
+    changed = {"limits": [1.0, 1.0], "force": 2**0.5, "rest_force": {"always": 2**0.5}, "impacts": impacts}
+    return {**impedance, **changed}
 
 
+def without_impacts(impedance):
+    return {**impedance, "contact_stiffness": 0.0, "impacts": []}
+
+
+IMPACTS = [impact_ratio(ratio) for ratio in checker.STIFFNESS_RATIOS]
 ALTERATIONS = {
+    "an impact": lambda c: change_claims(c, impedance__impacts=lambda impacts: [*impacts[:3], 0.99 * impacts[3]]),
+    "a missing impact": lambda c: change_claims(c, impedance__impacts=lambda impacts: impacts[:3]),
+    "impacts without a stiffness": lambda c: change_claims(c, impedance__contact_stiffness=lambda _: 0.0),
+    "a negative stiffness of a contact": lambda c: change_claims(c, impedance__contact_stiffness=lambda _: -1.0),
     "an upper bound": lambda c: change_claims(c, always__upper=change_entry((30, 0), plus=-0.01)),
     "a lower bound": lambda c: change_claims(c, always__lower=change_entry((30, 0), plus=0.01)),
     "a bound that is too wide": lambda c: change_claims(c, always__upper=change_entry((10, 1), plus=0.1)),
@@ -446,6 +470,7 @@ SUBJECT_ALTERATIONS = {
     "about": lambda c: change_claims(c, about=lambda _: {"task": "easier", "environment": {"guidance": "kgrl"}}),
     "limits": lambda c: change_claims(c, impedance=limit_forces_to_1_n),
     "stiffness": lambda c: change_claims(c, impedance=lambda _: None),
+    "contact_stiffness": lambda c: change_claims(c, impedance=without_impacts),
 }
 
 
@@ -698,7 +723,7 @@ def test_checker_exits_with_1_only_when_a_file_is_changed(valid_files, tmp_path,
 
 def test_checker_is_short_and_imports_numpy_only():
     source = Path(checker.__file__).read_text()
-    assert len(source.splitlines()) <= 450
+    assert len(source.splitlines()) <= 470
     imported = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -15,6 +15,7 @@ import hmac
 import io
 import itertools
 import json
+import math
 import sys
 import zipfile
 from decimal import Decimal, getcontext
@@ -34,11 +35,12 @@ COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit 
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec, DECIMAL = 60, 1e-59  # digits of decimal numbers, and their relative rounding error
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
+STIFFNESS_RATIOS = (1.0, 2.0, 4.0, 8.0)  # stiffnesses of contacts with claimed impacts, of `contact_stiffness`
 SMALLEST, LARGEST, UNDERFLOW = 1e-40, 1e40, 1e-60  # range of a primitive's numbers; bound on errors by underflow
 MAX_BYTES = 2**30  # largest size of the arrays of one file
 MAX_WINDOW = 500  # history and horizon together must be less [steps]; environments accept 200 of each
 # First halves of the SHA-256 of assumptions: the six required ones together, that of a budget, that of another period
-ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
+ASSUMED = ["1667823335eeaf59deffdc0b3a834045", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
 # Kind and shape of each array: N steps, O outputs, F rows, H steps of a window, T active steps, C corners, R rounds
 ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
     "primitive.npz": {
@@ -391,11 +393,21 @@ def compare(claims: dict[str, Arrays], computed: dict[str, Arrays]) -> None:
             require(is_valid, f"step {n}: {regime} {name} of output {o} is {values}")
 
 
+def peak(ratio: float) -> float:
+    """Return the first maximum of r x for x'' + 2 x' + r x = 1, x(0) = 0, x'(0) = 1/2, with the ratio r >= 1."""
+    w = math.sqrt(ratio - 1.0)
+    if w == 0.0:
+        return 1.0
+    t = (math.pi - math.atan(w)) / w  # x = 1/r - exp(-t) (cos(w t) / r + (1/r - 1/2) sin(w t) / w)
+    return 1.0 - math.exp(-t) * (math.cos(w * t) + (1.0 - ratio / 2.0) * math.sin(w * t) / w)
+
+
 def check_forces(impedance: Any, computed: dict[str, Arrays], outputs: int) -> None:
     """Reject forces that do not follow from `impedance` and from `computed` bounds; None: no impedance."""
     if impedance is None:
         return
-    fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")
+    names = ("stiffness", "limits", "contact_stiffness", "force", "rest_force", "impacts")
+    fields(impedance, names, "impedance")
     stiffness, limits = (numbers(impedance[k], (outputs,), k) for k in ("stiffness", "limits"))
     require(all(SMALLEST <= x <= LARGEST for x in (*stiffness, *limits)), "stiffness or limits are out of range")
     at_rest = fields(impedance["rest_force"], tuple(regime for regime in computed if regime != "free"), "rest_force")
@@ -404,6 +416,12 @@ def check_forces(impedance: Any, computed: dict[str, Arrays], outputs: int) -> N
         ranges = computed[regime]["upper"].max(axis=0) - computed[regime]["lower"].min(axis=0)
         own = np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3])
         claims[f"{regime} rest_force"] = own, numbers(claim, (), "rest_force")
+    contact = numbers(impedance["contact_stiffness"], (), "contact_stiffness")
+    require(contact == 0 or SMALLEST <= contact <= LARGEST, "contact_stiffness is out of range")
+    ratios = STIFFNESS_RATIOS if contact else ()
+    impacts = numbers(impedance["impacts"], (len(ratios),), "impacts")
+    for ratio, claim in zip(ratios, impacts, strict=True):
+        claims[f"impact at {ratio:g} times the stiffness"] = claims["force"][0] * peak(ratio), claim
     for name, (own, claim) in claims.items():
         require(own <= claim <= own * (1 + 4 * AGREEMENT), f"{name} is {own:.6g} N, not {claim:.6g} N")
 
@@ -411,7 +429,7 @@ def check_forces(impedance: Any, computed: dict[str, Arrays], outputs: int) -> N
 def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
     """Return the claims of a valid certificate, signed with the key if one is given; otherwise raise `Rejected`."""
     p, witness, claims = read(folder, key)
-    require(claims["format"] == "guiderail certificate 5", "wrong format")
+    require(claims["format"] == "guiderail certificate 6", "wrong format")
     require(type(claims["kernel"]) is str and claims["kernel"] in KERNELS, f"the kernel is none of {list(KERNELS)}")
     require(type(claims["about"]) is dict and "task" in claims["about"], "the certificate does not name its task")
     period = Real(numbers(claims["period"], (), "period"))
@@ -419,7 +437,7 @@ def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
     is_stated = True, claims["budgeted"] is not None, abs(period - p["clock"]) > 1e-6 * p["clock"]
     sentences = claims["assumes"]
     require(type(sentences) is list and all(type(each) is str for each in sentences), "assumes is not a list of texts")
-    digests = [hashlib.sha256(text.encode()).hexdigest()[:32] for text in ("\n".join(sentences[:6]), *sentences[6:])]
+    digests = [hashlib.sha256(text.encode()).hexdigest()[:32] for text in ("\n".join(sentences[:7]), *sentences[7:])]
     require(digests == list(itertools.compress(ASSUMED, is_stated)), "it does not state the required assumptions")
     (steps, outputs), A = p["means"].shape, int((p["gains"] != 0).sum())
     claimed = {}

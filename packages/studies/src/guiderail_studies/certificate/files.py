@@ -10,13 +10,14 @@ from typing import Any, cast
 import numpy as np
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import impact_ratio
 from guiderail.models.primitives.kernels import kernel_name
 from guiderail_studies.certificate import checker
 from guiderail_studies.certificate.bounds import CertifiedBounds
 from guiderail_studies.certificate.loop import Bounds, CertifiedLoop
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 5"
+FORMAT = "guiderail certificate 6"
 OUTWARD = 1e-5  # margin of all claims for the rounding of primitive and checker, relative to the largest value
 # The checker has digests of these sentences in `ASSUMED`.
 ASSUMPTIONS = (
@@ -24,8 +25,10 @@ ASSUMPTIONS = (
     "the skill is executed from its first step to its last with the given period, and begins at rest within the start",
     "the history consists of commands, and its length is constant",
     "the quadratic program is solved if a constraint is active: a fallback is within the constraints and is counted",
-    "the impedance has the given stiffness and saturates at its limits; forces are its own, without impacts",
+    "the impedance has the given stiffness and saturates at its limits; `force` and `rest_force` are its own",
     "`rest_force` holds for a robot at rest between the least and the greatest command",
+    "`impacts` are of contacts of 1, 2, 4 and 8 times `contact_stiffness`, to which the impedance limits the approach "
+    "speed, without the controller's delay, joint friction, and a contact that adds energy",
 )
 BUDGET = (
     "`budgeted` holds for sequences whose corrections satisfy two budgets, each at one step and in total: their excess "
@@ -43,6 +46,7 @@ def certificate_files(
     certified: CertifiedBounds,
     stiffness: np.ndarray | None,
     limits: np.ndarray | None,
+    contact_stiffness: float,
     about: Mapping[str, Any],
     key: bytes | None = None,
 ) -> dict[str, bytes]:
@@ -54,6 +58,8 @@ def certificate_files(
         stiffness: Stiffness (6,) [N/m, Nm/rad] of the impedance that executes the commands; None if the robot has no
             impedance.
         limits: Limits (6,) of the impedance's wrench [N, Nm]; None if the robot has no impedance.
+        contact_stiffness: Stiffness of a contact for which the impedance limits the approach speed [N/m]; 0 if it does
+            not.
         about: Texts that identify the skill, by name: the task, and further texts such as the run.
         key: Key of the signature; None for no signature. The checker rejects a key of fewer than 16 bytes.
 
@@ -93,11 +99,15 @@ def certificate_files(
         for regime, bounds in regimes.items():
             largest = np.asarray(stiffness) * (bounds.upper.max(axis=0) - bounds.lower.min(axis=0))
             rest_force[regime] = (1.0 + OUTWARD) * float(np.linalg.norm(np.minimum(limits, largest)[:3]))
+        force = (1.0 + OUTWARD) * float(np.linalg.norm(limits[:3]))
+        ratios = checker.STIFFNESS_RATIOS if contact_stiffness else ()
         claims["impedance"] = {
             "stiffness": list(map(float, stiffness)),
             "limits": list(map(float, limits)),
-            "force": (1.0 + OUTWARD) * float(np.linalg.norm(limits[:3])),
+            "contact_stiffness": float(contact_stiffness),
+            "force": force,
             "rest_force": rest_force,
+            "impacts": [force * impact_ratio(ratio) for ratio in ratios],
         }
     return {**files, CERTIFICATE: seal(claims, key)}
 
@@ -116,6 +126,7 @@ def compare_subject(
     loop: CertifiedLoop,
     stiffness: np.ndarray | None,
     limits: np.ndarray | None,
+    contact_stiffness: float,
     about: Mapping[str, Any],
 ) -> str | None:
     """Return the name of the first difference between a certificate and a skill, or None.
@@ -129,10 +140,11 @@ def compare_subject(
     """
     claims = json.loads(files[CERTIFICATE])
     claimed = {name: claims[name] for name in ("about", "kernel", "period")}
-    claimed |= {name: (claims["impedance"] or {}).get(name) for name in ("stiffness", "limits")}
+    claimed |= {name: (claims["impedance"] or {}).get(name) for name in ("stiffness", "limits", "contact_stiffness")}
     own: dict[str, Any] = {"about": dict(about), "kernel": _checked_kernel(loop), "period": float(loop.period)}
     own |= {"stiffness": stiffness, "limits": limits}
     own |= {name: list(map(float, own[name])) for name in ("stiffness", "limits") if own[name] is not None}
+    own["contact_stiffness"] = None if stiffness is None else float(contact_stiffness)
     different = [name for name, value in own.items() if claimed[name] != value]
     for file, arrays in zip((PRIMITIVE, CONSTRAINTS), _subject_arrays(loop), strict=True):
         with np.load(BytesIO(files[file])) as written:
