@@ -30,7 +30,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from inspect import unwrap
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -52,6 +52,7 @@ def _systems(path: Path) -> list[str]:
 
 CONSTANTS = (bool, int, float, str, tuple, list, frozenset, set, np.ndarray)
 WRAPPERS = (property, classmethod, staticmethod, cached_property)
+_CACHED = type(lru_cache(len))
 TEST_MODULES: set[str] = set()
 PRIMITIVES = ["tests/models/primitives"]
 HARDWARE = "packages/hardware"
@@ -181,7 +182,9 @@ def _function(value: Any) -> Any:
     """Return the function wrapped by a property, class method, static method or decorator."""
     for name in ("fget", "__func__", "func"):
         value = getattr(value, name) if isinstance(value, WRAPPERS) and hasattr(value, name) else value
-    return unwrap(value) if isinstance(value, FunctionType) else value
+    if isinstance(value, _CACHED):
+        value.cache_clear()  # of results from before the mutation
+    return unwrap(value) if isinstance(value, FunctionType | _CACHED) else value
 
 
 class _Coverage:
