@@ -167,6 +167,7 @@ def test_lowered_bound_is_never_above_the_original():
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
     assert (lower.contact_stiffness, lower.contact_lever) == (BOUND.contact_stiffness, BOUND.contact_lever)
     np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
+    assert BOUND.numbers.shape == (8,)
 
 
 @pytest.mark.parametrize(("force", "torque"), [(12.0, 1.5), (12.0, np.inf), (np.inf, 1.5), (np.inf, np.inf)])
@@ -175,6 +176,8 @@ def test_norm_limits_bound_every_wrench_within_the_axes(force, torque):
     for block, norm, limit in ((bound[:3], bound[6], force), (bound[3:6], bound[7], torque)):
         np.testing.assert_array_equal(np.linalg.norm(block), norm)
         assert 0.98 * limit <= norm <= limit * (1 + 1e-15)
+    if np.isfinite(force):
+        np.testing.assert_allclose(bound[:3], [0.45 * force, 0.45 * force, 0.75 * force])
     assert norm_limits(force=force)[7] == np.inf
     with pytest.raises(InputError, match="must be positive"):
         norm_limits(0.0, torque)
