@@ -144,24 +144,30 @@ def slow_down(
         inertia: Moving mass m and moment of inertia I.
         bound: Bound of the wrench, with F, the stiffness k of the contact, and l.
     """
-    s, t, v, w = spring[:3], spring[3:], velocity[:3], velocity[3:]
-    impedance, lever = approach_impedance(bound.contact_stiffness, inertia.mass), bound.contact_lever
-    speed, turn = norm(v), norm(w)
-    if s.dot(v) > 0.0:
-        limit = bound.force - max(0.0, impedance * speed - float(damping[:3].dot(v)) / speed) - impedance * lever * turn
-        s = _shortened(s, limit)
-    weight = lever * inertia.mass / inertia.moment
-    if weight > 0.0 and t.dot(w) > 0.0:
-        limit = bound.force - norm(s) - impedance * speed
-        limit -= max(0.0, impedance * lever * turn - weight * float(damping[3:].dot(w)) / turn)
-        t = _shortened(t, limit / weight)
-    return np.concatenate([s, t])
+    # Python numbers: NumPy's overhead would exceed the computation, which runs at every plant step.
+    sx, sy, sz, tx, ty, tz = spring.tolist()
+    vx, vy, vz, wx, wy, wz = velocity.tolist()
+    lever = bound.contact_lever
+    pushes, turns = sx * vx + sy * vy + sz * vz > 0.0, tx * wx + ty * wy + tz * wz > 0.0 and lever > 0.0
+    if not (pushes or turns):
+        return spring
+    impedance = approach_impedance(bound.contact_stiffness, inertia.mass)
+    push, speed, turn = math.hypot(sx, sy, sz), math.hypot(vx, vy, vz), math.hypot(wx, wy, wz)
+    push_share = turn_share = 1.0
+    if pushes:
+        limit = bound.force - max(0.0, impedance * speed - float(damping[:3].dot(velocity[:3])) / speed)
+        push_share = _share(push, limit - impedance * lever * turn)
+    if turns:
+        weight = lever * inertia.mass / inertia.moment
+        limit = bound.force - push_share * push - impedance * speed
+        limit -= max(0.0, impedance * lever * turn - weight * float(damping[3:].dot(velocity[3:])) / turn)
+        turn_share = _share(weight * math.hypot(tx, ty, tz), limit)
+    return spring if push_share == turn_share == 1.0 else spring * ([push_share] * 3 + [turn_share] * 3)
 
 
-def _shortened(vector: np.ndarray, limit: float) -> np.ndarray:
-    """Return the vector (3,) with at most the length `limit`, zero if that is negative."""
-    length = norm(vector)
-    return vector if length <= limit else vector * (max(0.0, limit) / length)
+def _share(size: float, limit: float) -> float:
+    """Return the share, from 0 to 1, of a number that is at most `limit`."""
+    return 1.0 if size <= limit else max(0.0, limit) / size
 
 
 def approach_impedance(contact_stiffness: float, mass: float) -> float:
@@ -203,8 +209,9 @@ def bounded_wrench(
     """
     s = clip_wrench(spring, bound.axes, bound.force, bound.torque)
     # A force that brakes at its limit leaves no room for the damper, on which the limit of the torque relies.
-    s = slow_down(s, damping_share(s, damping, bound) * damping, velocity, inertia, bound)
-    return s - damping_share(s, damping, bound) * damping
+    share = damping_share(s, damping, bound)
+    slow = slow_down(s, share * damping, velocity, inertia, bound)
+    return slow - (share if slow is s else damping_share(slow, damping, bound)) * damping
 
 
 def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
