@@ -109,8 +109,8 @@ class Impedance:
     def with_max_force(self, force: float, lever: float = CONTACT_LEVER) -> Impedance:
         """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
-        No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed
-        is limited for contacts of at most `CONTACT_STIFFNESS`, at most at the distance `lever` [m] from the tool center.
+        No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
+        limited for contacts of at most `CONTACT_STIFFNESS`, at most at the distance `lever` [m] from the tool center.
         """
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))

@@ -92,8 +92,8 @@ def turning_tool(bound, inertia, rng, distance, lever=0.03, steps=4_000, step=1e
     """Simulate a plane tool on a distant reference that switches; return its speeds and the forces of a contact.
 
     The tool moves along y and turns about x. A point at the distance l on its side touches a wall of the bound's
-    stiffness `distance` ahead. The result has a row for each step: the largest speed |v| + l |ω| of a point, and the contact's
-    force.
+    stiffness `distance` ahead. The result has a row for each step: the largest speed |v| + l |ω| of a point, and the
+    contact's force.
     """
     damping, D_turn = 2.0 * np.sqrt(K * inertia.mass), 2.0 * np.sqrt(30.0 * inertia.moment)
     y, turn, v, w, rows = 0.0, 0.0, 0.0, 0.0, []

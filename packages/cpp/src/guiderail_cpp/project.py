@@ -125,9 +125,7 @@ def _force_arrays(skill: TrainedSkill) -> Arrays:
 def governor_arrays(
     stiffness: np.ndarray, damping: np.ndarray, bound: np.ndarray, inertia: MovingInertia, step: float
 ) -> Arrays:
-    """Return the arrays of a reference governor; `bound` (10,) has six limits, two norms, and a contact's stiffness and
-    lever.
-    """
+    """Return the arrays of a reference governor; `bound` (10,) is a `WrenchBound` with stiffness and lever."""
     return {
         "governor/stiffness": stiffness, "governor/damping": damping, "governor/bound": bound,
         "governor/mass": np.array([inertia.mass]), "governor/moment": np.array([inertia.moment]),
