@@ -207,9 +207,11 @@ class InsertionTask(Task):
 
     def impedance(self) -> Impedance | None:
         """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
-        if not self.bounded_force:
-            return None
-        return Impedance().with_max_force(self.largest_force_limit, contact_lever(self.workcell()))
+        return Impedance().with_max_force(self.largest_force_limit, self._contact_lever) if self.bounded_force else None
+
+    @cached_property
+    def _contact_lever(self) -> float:
+        return contact_lever(self.workcell())
 
     def exceeds_force_limit(self) -> Callable[..., bool]:
         """Return the condition of a collision: a force above `force_limit` [N], or above a sampled limit."""

@@ -30,7 +30,7 @@ from guiderail.tools.tables import write_table
 from guiderail_studies.certificate import checker
 from guiderail_studies.certificate.adversary import QUANTITIES, Adversary, AttackResult
 from guiderail_studies.certificate.bounds import CertifiedBounds, certify
-from guiderail_studies.certificate.files import CERTIFICATE, certificate_files, compare_subject
+from guiderail_studies.certificate.files import CERTIFICATE, STIFFNESS_RATIOS, certificate_files, compare_subject
 from guiderail_studies.certificate.lagrange_bounds import Budget
 from guiderail_studies.certificate.loop import Bounds, CertifiedLoop
 
@@ -108,7 +108,7 @@ def certify_skill(
     if limits is not None:
         result["force"] = force = float(np.linalg.norm(limits[:3]))
         if contact:
-            names = {ratio: f"impact_at_{ratio * contact / 1e3:.0f}_N_per_mm" for ratio in checker.STIFFNESS_RATIOS}
+            names = {ratio: f"impact_at_{ratio * contact / 1e3:.0f}_N_per_mm" for ratio in STIFFNESS_RATIOS}
             result |= {name: force * impact_ratio(ratio) for ratio, name in names.items()}
     if attack:
         result |= _attack(loop, certified, attack, out)

@@ -30,6 +30,7 @@ ASSUMPTIONS = (
     "`impacts` are of contacts of 1, 2, 4 and 8 times `contact_stiffness`, to which the impedance limits the approach "
     "speed, without the controller's delay, joint friction, and a contact that adds energy",
 )
+STIFFNESS_RATIOS = (1.0, 2.0, 4.0, 8.0)  # contacts with claimed impacts, relative to `contact_stiffness`
 BUDGET = (
     "`budgeted` holds for sequences whose corrections satisfy two budgets, each at one step and in total: their excess "
     "over actions of [-1, 1], and their displacement of outputs that no action moves. A search of 100,000 steps needed "
@@ -100,7 +101,7 @@ def certificate_files(
             largest = np.asarray(stiffness) * (bounds.upper.max(axis=0) - bounds.lower.min(axis=0))
             rest_force[regime] = (1.0 + OUTWARD) * float(np.linalg.norm(np.minimum(limits, largest)[:3]))
         force = (1.0 + OUTWARD) * float(np.linalg.norm(limits[:3]))
-        ratios = checker.STIFFNESS_RATIOS if contact_stiffness else ()
+        ratios = STIFFNESS_RATIOS if contact_stiffness else ()
         claims["impedance"] = {
             "stiffness": list(map(float, stiffness)),
             "limits": list(map(float, limits)),
