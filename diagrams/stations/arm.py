@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, JointActuator, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from guiderail.diagrams.stations.impedance_control import add_impedance_control
 from guiderail.diagrams.stations.options import ArmOptions, JointTorqueAccuracy
@@ -32,7 +32,7 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
-from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
+from guiderail.models.robots.mounting import add_drives, add_end_effector, add_joint_friction, add_robot, lighten_rotors
 from guiderail.models.robots.robot import EndEffector, Robot, find_end_effector, find_robot
 from guiderail.systems.gripper_command import GripperCommand
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -63,14 +63,18 @@ def add_arm(
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     *,
     as_rigid: bool = False,
+    joint_friction: float = 0.0,
 ) -> ArmModel:
     """Add arm, tool and workpiece to a plant that is not finalized; the arm's base is at the world's origin.
 
     `robot` and `end_effector` are objects or names. With `as_rigid`, a gripper is one rigid body in its open state.
+    With `joint_friction` [Nm], each joint of the arm has a second actuator; see `add_joint_friction`.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
     lighten_rotors(robot, arm)
+    if joint_friction:
+        add_joint_friction(plant, arm.actuators, joint_friction)
     tool = add_end_effector(plant, robot, arm, end_effector, as_rigid=as_rigid)
     if tool.actuators and end_effector.drives is not None:
         add_drives(tool.actuators, end_effector.drives)
@@ -182,6 +186,7 @@ class ArmStation(Station):
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
         joint_torque: JointTorqueAccuracy | None = None,
+        joint_friction: float = 0.0,
         control_period: float = CONTROL_PERIOD,
     ):
         """Construct the station.
@@ -195,6 +200,7 @@ class ArmStation(Station):
             end_effector: The tool, or its name: see `end_effector_names()`.
             joint_torque: Errors of the joint torques from which the wrench is estimated; None for a sensor at the
                 wrist.
+            joint_friction: Coulomb friction of each joint of the arm [Nm], which the controller does not know.
             control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
@@ -210,7 +216,10 @@ class ArmStation(Station):
         self.control_period = control_period
         self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
-            builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
+            builder,
+            workcell,
+            time_step,
+            lambda plant: add_arm(plant, workcell, robot, end_effector, joint_friction=joint_friction),
         )
         plant, arm = self.plant, self.arm
         sensor = WrenchSensor(
@@ -231,6 +240,11 @@ class ArmStation(Station):
             wrench=wrench,
             contact_wrench=contact_wrench,
         )
+        if joint_friction:
+            n = torque.size()
+            torque = add_system(builder, "without_friction", MatrixGain(np.eye(2 * n, n)), torque).get_output_port()
+            at_rest = builder.AddNamedSystem("friction_at_rest", ConstantVectorSource(np.zeros(4 * n)))
+            builder.Connect(at_rest.get_output_port(), plant.get_desired_state_input_port(arm.model))
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))
         if arm.gripper:
             position, state = add_gripper_control(builder, plant, arm, end_effector, time_step)

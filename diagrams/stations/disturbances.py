@@ -221,6 +221,10 @@ def disturbed(
         nominal = impedance or (default if isinstance(default, Impedance) else Impedance())
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
         arguments["impedance"] = replace(nominal, stiffness=stiffness)
+    if disturbances.joint_friction:
+        if "joint_friction" not in inspect.signature(build).parameters:
+            raise InputError("only an arm's joints have friction: choose station=arm, or leave joint_friction out")
+        arguments["joint_friction"] = disturbances.joint_friction
     errors = disturbances.errors
     if errors.joint_torque is not None and "joint_torque" in inspect.signature(build).parameters:
         arguments["joint_torque"] = errors.joint_torque

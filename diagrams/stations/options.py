@@ -184,7 +184,7 @@ class Disturbances(Options):
     ) | entries_of(
         "disturbances",
         "friction_factor", "modulus_factor", "stiffness_factor", "lost_commands", "late_commands", "clock_factor",
-        "payload",
+        "payload", "joint_friction",
     )  # fmt: skip
 
     sensing: Sensing = Field(
@@ -223,6 +223,12 @@ class Disturbances(Options):
     stiffness_factor: Number = Field(1.0, gt=0, le=MAX_FACTOR, description="factor of the impedance's stiffness")
     payload: Number = Field(
         0.0, ge=0, le=5, description="mass at an arm's tool that its controller does not model [kg]"
+    )
+    joint_friction: Number = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="Coulomb friction of each of an arm's joints that its controller does not model [Nm]",
     )
 
     @property

@@ -24,6 +24,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.parsing import add_models
 from guiderail.models.robots.robot import EndEffector, JointDrives, Robot
 
+SLIP = 1e-3  # speed above which a joint's friction is constant [rad/s]
+TINY_STIFFNESS = 1e-12  # of joint friction [Nm/rad], because Drake requires a positive one
+
 
 @dataclass(frozen=True)
 class MountedRobot:
@@ -101,6 +104,20 @@ def add_drives(actuators: Sequence[JointActuator], drives: JointDrives) -> None:
     """Add a spring to the desired position and a damper to each joint; the plant integrates both implicitly."""
     for actuator, stiffness, damping in zip(actuators, drives.stiffness, drives.damping, strict=True):
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
+
+
+def add_joint_friction(plant: MultibodyPlant, actuators: Sequence[JointActuator], torque: float) -> None:
+    """Add Coulomb friction of at most `torque` [Nm] to the joint of each actuator; below `SLIP` it is viscous.
+
+    The friction is a further actuator of the joint, whose effort limit is `torque`. It damps the joint, and the plant
+    integrates it implicitly: held for a time step, friction would make a light wrist oscillate.
+    """
+    for actuator in actuators:
+        friction = plant.AddJointActuator(f"{actuator.name()}_friction", actuator.joint(), torque)
+        friction.set_controller_gains(PdControllerGains(p=TINY_STIFFNESS, d=torque / SLIP))
+        # Drake uses the reflected inertia of a joint's last actuator only.
+        friction.set_default_rotor_inertia(actuator.default_rotor_inertia())
+        friction.set_default_gear_ratio(actuator.default_gear_ratio())
 
 
 def _read(plant: MultibodyPlant, file: Path, label: str) -> list[ModelInstanceIndex]:

@@ -24,8 +24,10 @@ def test_integer_values_are_equally_likely():
 
 def test_every_draw_is_a_valid_environment():
     parameters, left_out = select_parameters("BncConnector", CONNECTOR)
-    assert left_out["payload"] == "only an arm carries a payload"
-    assert "joint_friction" in left_out
+    assert left_out["payload"] == left_out["joint_friction"] == "only an arm has it"
+    assert "damping" in left_out
+    on_arm, _ = select_parameters("BncConnector", {"station": "arm"})
+    assert {"payload", "joint_friction"} <= {parameter.name for parameter in on_arm}
     for quantiles in np.random.default_rng(0).uniform(size=(20, len(parameters))):
         changes = options_of("BncConnector", CONNECTOR, parameters, quantiles)
         check_environment("BncConnector", {**CONNECTOR, **changes})

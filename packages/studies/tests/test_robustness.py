@@ -162,7 +162,7 @@ def test_points_cover_every_value_or_name_a_reason(task):
         assert all(environments[value] != arguments for value in environments if value != axis.default)
     names = {sentence.split()[0] for sentence in left_out}
     assert names.isdisjoint({point.axis.name for point in result} - {"clearance"})
-    assert names <= {"payload", "clearance", "offsets"}
+    assert names <= {"payload", "joint_friction", "clearance", "offsets"}
     assert all(": " in sentence for sentence in left_out)
 
 

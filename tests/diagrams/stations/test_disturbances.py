@@ -145,6 +145,26 @@ def test_payload_is_added_to_the_tool_mass_of_an_arm():
     assert tool.get_mass(arm.plant.CreateDefaultContext()) == pytest.approx(tool.default_mass())
 
 
+def test_joint_friction_keeps_an_arm_away_from_its_command():
+    def error(friction):
+        """Return the distance along x and y from the command, after 0.5 s of the demonstration in free motion [m]."""
+        env = make_env(
+            "BncConnector", guidance="kgrl", station="arm", difficulty="hard", disturbances={"joint_friction": friction}
+        )
+        env.reset(seed=1)
+        for _ in range(10):
+            env.step(np.zeros(env.action_space.shape))
+        station = env.diagram.diagram.GetSubsystemByName("station")
+        context = station.GetMyContextFromRoot(env.simulator.get_context())
+        command = station.get_desired_pose_input_port().Eval(context)
+        return np.linalg.norm((station.get_pose_output_port().Eval(context) - command)[:2])
+
+    assert error(0.0) < 2e-4
+    assert error(0.7) > 5e-4
+    with pytest.raises(InputError, match="only an arm's joints have friction"):
+        make_env("GridClamp", station="gantry", disturbances={"joint_friction": 0.1})
+
+
 def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 

@@ -6,10 +6,11 @@ import re
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.parsing import add_models
-from guiderail.models.robots.mounting import add_end_effector, add_robot, lighten_rotors
+from guiderail.models.robots.mounting import SLIP, add_end_effector, add_joint_friction, add_robot, lighten_rotors
 from guiderail.models.robots.robot import find_end_effector, find_robot
 
 UR5E = find_robot("ur5e")
@@ -96,6 +97,34 @@ def test_lighten_rotors_scales_the_rotor_inertia():
     lighten_rotors(robot, arm)
     after = [actuator.default_reflected_inertia() for actuator in arm.actuators]
     assert after == pytest.approx([0.25 * inertia for inertia in before])
+
+
+@pytest.mark.parametrize("time_step", [0.005, 0.001])
+def test_joint_friction_holds_up_to_its_torque_and_then_resists_with_it(time_step):
+    robot, friction = find_robot("iiwa14"), 0.7
+
+    def speed(torque, has_friction=True):
+        """Return the speed of the last joint after 20 ms, at first at rest [rad/s]."""
+        plant = MultibodyPlant(time_step)
+        arm = add_robot(plant, robot)
+        lighten_rotors(robot, arm)
+        if has_friction:
+            add_joint_friction(plant, arm.actuators, friction)
+        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+        plant.Finalize()
+        simulator = Simulator(plant)
+        context = simulator.get_mutable_context()
+        torques = np.zeros(plant.num_actuators())
+        torques[6] = torque
+        plant.get_actuation_input_port(arm.model).FixValue(context, torques)
+        if has_friction:
+            plant.get_desired_state_input_port(arm.model).FixValue(context, np.zeros(2 * len(torques)))
+        simulator.AdvanceTo(0.02)
+        return plant.GetVelocities(context)[6]
+
+    assert 0.0 < speed(0.9 * friction) < SLIP
+    for sign in (1.0, -1.0):
+        assert speed(3.0 * sign * friction) == pytest.approx(speed(2.0 * sign * friction, has_friction=False), rel=0.01)
 
 
 def test_add_end_effector_as_rigid_adds_one_body():

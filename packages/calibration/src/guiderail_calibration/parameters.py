@@ -11,7 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.environments import check_environment
-from guiderail_studies.robustness import AXES, Axis
+from guiderail_studies.robustness import AXES, ONLY_ON_ARM, Axis
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ PARAMETERS = tuple(
         ("lost", 0.0, 0.4, "linear"),
         ("late", 0, 6, "integer"),
         ("payload", 0.0, 1.0, "linear"),
+        ("joint_friction", 0.0, 1.0, "linear"),
     )
 )
 NOT_OFFERED = {
-    "joint_friction": "no simulated station has joint friction",
     "damping": "no option changes the damping of the impedance",
     "inertia": "no option changes the apparent inertia of the robot",
 }
@@ -98,8 +98,8 @@ def select_parameters(
 
 def _reason(task: str, resolved: Mapping[str, Any], environment: Mapping[str, Any], parameter: Parameter) -> str:
     """Return why an environment does not have a parameter; "" if it has it."""
-    if parameter.name == "payload" and resolved.get("station") != "arm":
-        return "only an arm carries a payload"
+    if parameter.name in ONLY_ON_ARM and resolved.get("station") != "arm":
+        return "only an arm has it"
     try:
         for value in parameter.value(np.array([0.0, 0.5, 1.0])):
             check_environment(task, {**environment, **parameter.axis.change(resolved, float(value))})

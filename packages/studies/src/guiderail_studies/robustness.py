@@ -127,7 +127,9 @@ AXES = (
     Axis("late", "command delay [steps]", (0, 1, 2, 5, 10), 0, _scalar("disturbances.late_commands", kind=int)),
     Axis("period", "control period (factor)", (0.5, 1.0, 1.5, 2.0), 1.0, _period),
     Axis("payload", "unmodeled payload [kg]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _scalar("disturbances.payload")),
+    Axis("joint_friction", "joint friction [Nm]", (0.0, 0.1, 0.3, 0.7), 0.0, _scalar("disturbances.joint_friction")),
 )
+ONLY_ON_ARM = ("payload", "joint_friction")  # names of axes
 
 
 def select_axes(names: str | None) -> list[Axis]:
@@ -175,8 +177,8 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
         for value in axis.values:
             try:
                 changes = {} if value == trained else axis.change(resolved, value)
-                if axis.name == "payload" and resolved.get("station") != "arm":
-                    raise InputError("only an arm carries a payload")
+                if axis.name in ONLY_ON_ARM and resolved.get("station") != "arm":
+                    raise InputError("only an arm has it")
                 check_environment(task, {**resolved, **changes})
                 changed = {**environment, **changes}
                 needs_new_run = axis.resamples and has_constant_offset(task, {**resolved, **changed})
