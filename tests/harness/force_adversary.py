@@ -4,16 +4,16 @@
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
 
 A case is a task at difficulty=hard, on a station, with a contact of a given stiffness. Each round of a case draws a
-guidance, a factor of the friction and a range of force limits, on an arm also a payload that its controller does not
-model, and on the gantry a factor of the moving mass. In two of three rounds the guidance is `Anywhere`, which commands
-what a policy behind guidance cannot: any reference in a box around the target, to fall on the rim, or off it and into
-the walls. Half of the episodes belong to an evolution strategy, which changes actions or conditions of the episode with
-the largest transient force.
+guidance, a factor of the friction and a range of force limits, on an arm also a payload and a friction of the joints
+that its controller does not model, and on the gantry a factor of the moving mass. In two of three rounds the guidance
+is `Anywhere`, which commands what a policy behind guidance cannot: any reference in a box around the target, to fall on
+the rim, or off it and into the walls. Half of the episodes belong to an evolution strategy, which changes actions or
+conditions of the episode with the largest transient force.
 
-The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md), relative to the
-limit of the episode plus the weight of the payload. It is printed, and written to `--out`. A run continues from that
-file; only the search starts again then. The exit code is 1 if an episode ended by force, or if a force exceeded its
-bound.
+The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md). Contact forces
+are less what the joints' friction holds, relative to the limit of the episode plus the weight of the payload. The table
+is printed, and written to `--out`. A run continues from that file; only the search starts again then. The exit code is
+1 if an episode ended by force, or if a force exceeded its bound.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.make import make_env
@@ -36,6 +36,8 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
 from guiderail.models.control.wrench import FORCE_SHARES, impact_ratio
 from guiderail.models.laws.law import Command, Law
+from guiderail.models.robots.robot import find_robot
+from guiderail_mujoco.station import MujocoContact
 
 ANYWHERE = "anywhere"  # registered name of `Anywhere`
 GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
@@ -59,6 +61,7 @@ REACH = np.array([0.008, 0.008, 0.025, 0.3, 0.1, 0.1])  # of `Anywhere` from the
 ATTACKS = ("random", "constant", "extreme", "bang_bang")
 LIMITS = (8.0, 25.0)  # range of sampled force limits [N]
 PAYLOADS = (0.0, 0.25, 0.5)  # a weight of up to 5 N, the largest that is not refused before a motion [kg]
+JOINT_FRICTIONS = (0.0, 0.3, 0.7)  # of each joint of the arm [Nm]
 MASS_FACTORS = (0.8, 1.0, 1.2)
 GRAVITY = 9.81  # [m/s²]
 MASS = {"gantry": 1.5, "arm": 1.4, "mujoco": 1.5}  # smallest moving mass in any direction [kg]
@@ -69,7 +72,10 @@ ROUND = 2000  # control steps of a round
 
 @dataclass
 class Case:
-    """Statistics of the attacks on a task; contact forces are relative to the limit of the episode plus the weight."""
+    """Statistics of the attacks on a task.
+
+    Contact forces are less what the joints' friction holds, relative to the limit of the episode plus the weight.
+    """
 
     task: str
     station: str
@@ -89,6 +95,9 @@ class Case:
 
     def __post_init__(self) -> None:
         self.quasi_static_bound = round(math.hypot(*FORCE_SHARES), 3)
+        if self.station == "mujoco" and CONTACTS["mujoco"][self.task][self.stiffness] == 1.0:
+            self.transient_bound = round(mujoco_bound(), 2)
+            return
         self.transient_bound = round(transient_bound(1e3 * self.stiffness, MASS[self.station], DELAY[self.station]), 2)
 
     @property
@@ -110,6 +119,18 @@ def transient_bound(stiffness: float, mass: float, delay: float) -> float:
         delay: Period of the controller, 0 if spring and damper are solved with the contact [s].
     """
     return impact_ratio(stiffness / CONTACT_STIFFNESS) + delay * math.sqrt(stiffness / mass)
+
+
+def mujoco_bound(mass: float = 1.65, contact: MujocoContact = MujocoContact()) -> float:  # noqa: B008 (frozen)
+    """Return the bound of a transient force in MuJoCo's own contact, relative to the limit F; `mass` is the largest.
+
+    This contact is a spring and a damper that act on the acceleration: damping b = 2 / (d τ) and stiffness 1 / (d τ²)
+    of a unit mass. At the approach speed F / (2 √(k m)) its damper decides. A step h before, the depth is at most the
+    speed times h.
+    """
+    d, constant, step = contact.impedance, contact.time_constant, contact.time_step
+    per_speed = 2.0 / (d * constant) + step / (d * constant**2)
+    return 1.0 + per_speed * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
 
 
 class Anywhere(Law):
@@ -172,8 +193,8 @@ def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool
     payload = float(rng.choice(PAYLOADS)) if case.station == "arm" else 0.0
     factor = float(rng.choice(MASS_FACTORS)) if case.station == "gantry" else 1.0
     friction = float(rng.choice(FRICTION_FACTORS))
-    if payload > 0.0:
-        options["disturbances"] = {"payload": payload}
+    joint_friction = float(rng.choice(JOINT_FRICTIONS)) if case.station == "arm" else 0.0
+    options["disturbances"] = {"payload": payload, "joint_friction": joint_friction}
     env = make_env(case.task, action_repeat=5, bounded_force=bounded, **options)
     size, best, done = env.action_space.shape[0], searches.setdefault(guidance, Search()), 0
     station, modulus = station_of(env), CONTACTS[case.station][case.task][case.stiffness]
@@ -189,21 +210,21 @@ def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool
         if factor != 1.0:
             scale_mass(env, factor)
         limit = info.get("force_limit", env.diagram.task.collision.above)
-        scale = limit + GRAVITY * payload
+        scale, held = limit + GRAVITY * payload, held_force(env, joint_friction)
         forces, terminated, truncated = watch_contact(env), False, False
         while not (terminated or truncated):
             *_, terminated, truncated, info = env.step(act())
-        transient = max(forces) / scale
+        transient = (max(forces) - held) / scale
         if candidate is not None and transient > best.force:
             candidate.force = transient
             searches[guidance] = best = candidate
-        wrench = env.trace.signals["wrench"][:, :3]
+        wrench, statistics = env.trace.signals["wrench"][:, :3], env.trace.statistics()
         case.episodes, case.control_steps = case.episodes + 1, case.control_steps + info["control_steps"]
         case.plant_steps += round(info["control_steps"] * env.diagram.control_period / station.time_step)
         case.stops += info["termination"] == "collision"
         case.impedance = max(case.impedance, round(float(env.trace.force.max()) / limit, 3))
-        case.filtered = max(case.filtered, round(float(np.linalg.norm(wrench, axis=1).max()) / scale, 3))
-        case.quasi_static = max(case.quasi_static, round(env.trace.statistics()["quasi_static_force"] / scale, 3))
+        case.filtered = max(case.filtered, round(float(np.linalg.norm(wrench, axis=1).max() - held) / scale, 3))
+        case.quasi_static = max(case.quasi_static, round((statistics["quasi_static_force"] - held) / scale, 3))
         case.transient = max(case.transient, round(transient, 3))
         case.tank_J = min(case.tank_J, round(tank_content(env), 2))
         done += info["control_steps"]
@@ -215,6 +236,25 @@ def station_of(env: Any) -> Any:
     """Return the station of an environment, without its disturbances."""
     station = env.diagram.diagram.GetSubsystemByName("station")
     return getattr(station, "_inner", station)
+
+
+def held_force(env: Any, joint_friction: float) -> float:
+    """Return the largest force at the tool center [N] against which an arm's joints at rest need no more than friction.
+
+    In the direction u, the joint with the largest lever arm slips first: min over joints of friction / |Jᵀ u|.
+    """
+    if joint_friction == 0.0:
+        return 0.0
+    station = station_of(env)
+    plant, arm = station.plant, station.arm
+    context = plant.GetMyContextFromRoot(env.simulator.get_context())
+    world, first = plant.world_frame(), plant.GetJointByName(find_robot("iiwa14").joints[0]).velocity_start()
+    jacobian = plant.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), world, world
+    )[:, first : first + plant.num_velocities(arm.model)]
+    directions = np.random.default_rng(0).standard_normal((4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return float((joint_friction / np.abs(directions @ jacobian).max(axis=1)).max())
 
 
 def scale_mass(env: Any, factor: float) -> None:
