@@ -1,4 +1,5 @@
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -6,8 +7,8 @@ import yaml
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import main
 from guiderail.tools.environments import changed_environment
-from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.learning.environment_set import load_variants
 from guiderail_calibration.calibrate import calibrate
@@ -20,12 +21,12 @@ RUN, GANTRY = "pretrained:connector", {"station": "gantry"}
 
 
 def record(folder, environment, episodes):
-    """Write a probing motion, and recordings of episodes of it on a stiff robot; return the folder."""
-    record_options(RUN, environment, folder / "probe.npz")
-    config = find_subject(RUN, None).config
-    base = changed_environment(config.task, config.environment, environment)
-    robot = {**base, **probe_options(folder / "probe.npz", base), "disturbances.stiffness_factor": 1.7}
-    evaluate("zero", config.task, episodes, environment=robot, baselines=(), processes=1, steps=folder / "recordings")
+    """Write a probing motion, and record episodes of it on a stiff robot by the printed command; return the folder."""
+    command = record_options(RUN, environment, folder / "probe.npz")["record"].partition(" --episodes ")[0]
+    further = f" --env disturbances.stiffness_factor=1.7 --episodes {episodes} --processes 1 --steps"
+    with pytest.raises(SystemExit) as exit_info:
+        main([*shlex.split(command + further)[1:], str(folder / "recordings")])
+    assert not exit_info.value.code
     return folder
 
 

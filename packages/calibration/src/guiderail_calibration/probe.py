@@ -5,6 +5,7 @@ It is a demonstration, so that the environment, a robot's executor and the force
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ SPIRAL = (1.5, 2.2, 0.6 * MM, 0.25 * MM)  # start [s], end [s], radius [m] and p
 WIGGLES = ((0.75, 1.0), (2.25, 2.75))  # starts and ends, on the rim and in the hole [s]
 WIGGLE = (0.6 * MM, 0.06, 0.25)  # amplitudes along x [m] and about z [rad], period [s]
 PRIOR_STD = (1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02)  # standard deviation that a single demonstration needs [m], [rad]
+NOMINAL = {"disturbances.friction_factor": (1.0, 1.0), "disturbances.modulus_factor": (1.0, 1.0)}  # not a run's range
 PLACED = {"fixture_offset": "none", "offset_range": None}  # options of a fixture where the motion expects it
 
 
@@ -106,14 +108,18 @@ def record_options(run: Path | str, environment: Mapping[str, Any], path: Path) 
     assert config is not None  # a run has one
     base = subject.changed_environment(dict(environment))
     write_probe(config.task, base, path)
-    options = beyond_defaults(config.task, check_environment(config.task, {**base, **probe_options(path, base)}))
-    given = " ".join(f"--env {name}={_text(value)}" for name, value in options.items() if value is not None)
+    nominal = {name: value for name, value in NOMINAL.items() if name in base}
+    recorded = {**base, **probe_options(path, base), **nominal}
+    options = beyond_defaults(config.task, check_environment(config.task, recorded))
+    given = " ".join(f"--env {shlex.quote(f'{name}={_text(value)}')}" for name, value in options.items())
     command = f"guiderail evaluate {config.task} --policy zero {given} --baselines none --episodes 5 --steps recordings"
     return {"probe": str(path), "record": command}
 
 
 def _text(value: Any) -> str:
     """Return the value of an option as it is typed on the command line."""
+    if value is None:
+        return "null"
     if isinstance(value, tuple | list):
         return f"[{','.join(map(_text, value))}]"
     return str(value).lower() if isinstance(value, bool) else str(value)
