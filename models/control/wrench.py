@@ -107,6 +107,9 @@ def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray
     return target.copy() if excess <= 1.0 else bound + change / excess
 
 
+PRESSED = 0.5  # share of the force by which the torque of a turning tool is reduced; see `slow_down`
+
+
 class MovingInertia(NamedTuple):
     """Inertia that moves with a tool: a mass [kg] and a moment of inertia [kg m²], both positive."""
 
@@ -129,13 +132,15 @@ def slow_down(
 ) -> np.ndarray:
     """Limit a spring's wrench (6,), so that no point of contact becomes faster than F / c.
 
-        |s| ≤ F − (c − d) |v| − c l |ω|,    κ |t| ≤ F − |s| − c |v| − (c l − κ d_ω) |ω|,    κ = l m / I
+        |s| ≤ F − (c − d) |v| − c l |ω|,    κ |t| ≤ F − |s| / 2 − c |v| − (c l − κ d_ω) |ω|,    κ = l m / I
 
     s and t are the spring's force and torque, v and ω the tool's velocities, and l is the largest distance of a contact
     from the tool center. c = 2 √(k m) is the `approach_impedance`. d = vᵀ D v / |v|² is the damping in the direction of
-    motion, and d_ω that of the rotation. A contact has at most the speed |v| + l |ω|, and at most the force |s| + κ |t|
-    accelerates the mass m there. Only a force or torque that does positive work is reduced. No energy is therefore
-    added: while it relaxes, the spring returns at most the energy that it stored.
+    motion, and d_ω that of the rotation. A contact has at most the speed u = |v| + l |ω|, and the force |s| + κ |t|
+    that accelerates the mass m there is at most 1.5 (F − c u), so that u stays below F / c. With |s| in place of half
+    of it, a bayonet could not be turned while a stiff impedance presses it. Only a force or torque that does positive
+    work is reduced. No energy is therefore added: while it relaxes, the spring returns at most the energy that it
+    stored.
 
     Args:
         spring: Wrench of the spring (6,) [N, Nm].
@@ -159,7 +164,7 @@ def slow_down(
         push_share = _share(push, limit - impedance * lever * turn)
     if turns:
         weight = lever * inertia.mass / inertia.moment
-        limit = bound.force - push_share * push - impedance * speed
+        limit = bound.force - PRESSED * push_share * push - impedance * speed
         limit -= max(0.0, impedance * lever * turn - weight * float(damping[3:].dot(velocity[3:])) / turn)
         turn_share = _share(weight * math.hypot(tx, ty, tz), limit)
     return spring if push_share == turn_share == 1.0 else spring * ([push_share] * 3 + [turn_share] * 3)
@@ -179,12 +184,24 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
     return 2.0 * math.sqrt(contact_stiffness * mass)
 
 
-def impact_ratio(stiffness_ratio: float) -> float:
-    """Return the peak force of an impact relative to the limit F, at the speed F / c that `slow_down` admits.
+def impact_ratio(stiffness_ratio: float, mass_share: float = 1.0) -> float:
+    """Return the largest force of an impact relative to the limit F, at the speeds that `slow_down` admits.
 
-    It is the first maximum of k_c x for m x'' + c x' + k_c x = F with x'(0) = F / c. `stiffness_ratio` is k_c / k, the
-    stiffness of the contact relative to the assumed one. The result is 1 up to 1, and 1.07, 1.30, 1.68 at 2, 4 and 8.
+    A tool that does not turn presses with F − c v, and its peak force is the first maximum p of k_c x for
+    m x'' + c x' + k_c x = F with x'(0) = F / c: 1 up to the assumed stiffness k, and 1.07, 1.30, 1.68 at 2, 4 and 8
+    times k. A tool that presses and turns pushes a contact at its lever with up to 1.5 (F − c u), where it has the mass
+    μ m, and then the peak is 1.5 μ p(k_c / (1.5² μ k)) F.
+
+    Args:
+        stiffness_ratio: Stiffness k_c of the contact relative to k.
+        mass_share: μ = 1 / (1 + l² m / I), at most 1: the mass at the lever relative to the moving mass.
     """
+    driven = 2.0 - PRESSED
+    turning = driven * mass_share * _peak(stiffness_ratio / (driven**2 * mass_share))
+    return max(_peak(stiffness_ratio), turning)
+
+
+def _peak(stiffness_ratio: float) -> float:
     if stiffness_ratio <= 1.0:
         return 1.0
     root = math.sqrt(stiffness_ratio)

@@ -65,6 +65,8 @@ JOINT_FRICTIONS = (0.0, 0.3, 0.7)  # of each joint of the arm [Nm]
 MASS_FACTORS = (0.8, 1.0, 1.2)
 GRAVITY = 9.81  # [m/s²]
 MASS = {"gantry": 1.5, "arm": 1.4, "mujoco": 1.5}  # smallest moving mass in any direction [kg]
+# Of the mass at the farthest contact on a gantry, 1 / (1 + l² m / I) for l = 14 and 44 mm; on an arm, I is not known.
+MASS_SHARE = {"BncConnector": 0.87, "GridClamp": 0.39}
 DELAY = {"gantry": 0.0, "arm": 0.005, "mujoco": 0.0}  # period of a controller that is not solved with the contact [s]
 SEED = 2_100_000
 ROUND = 2000  # control steps of a round
@@ -95,10 +97,12 @@ class Case:
 
     def __post_init__(self) -> None:
         self.quasi_static_bound = round(math.hypot(*FORCE_SHARES), 3)
+        share = 1.0 if self.station == "arm" else MASS_SHARE[self.task]
         if self.station == "mujoco" and CONTACTS["mujoco"][self.task][self.stiffness] == 1.0:
-            self.transient_bound = round(mujoco_bound(), 2)
-            return
-        self.transient_bound = round(transient_bound(1e3 * self.stiffness, MASS[self.station], DELAY[self.station]), 2)
+            bound = mujoco_bound(share)
+        else:
+            bound = transient_bound(1e3 * self.stiffness, MASS[self.station], DELAY[self.station], share)
+        self.transient_bound = round(bound, 2)
 
     @property
     def has_failed(self) -> bool:
@@ -110,18 +114,19 @@ class Case:
         )
 
 
-def transient_bound(stiffness: float, mass: float, delay: float) -> float:
+def transient_bound(stiffness: float, mass: float, delay: float, share: float) -> float:
     """Return the bound of a transient contact's force, relative to the limit.
 
     Args:
         stiffness: Stiffness of the contact [N/m].
         mass: Moving mass [kg].
         delay: Period of the controller, 0 if spring and damper are solved with the contact [s].
+        share: Share of the mass at the farthest contact; see `impact_ratio`.
     """
-    return impact_ratio(stiffness / CONTACT_STIFFNESS) + delay * math.sqrt(stiffness / mass)
+    return impact_ratio(stiffness / CONTACT_STIFFNESS, share) + delay * math.sqrt(stiffness / mass)
 
 
-def mujoco_bound(mass: float = 1.65, contact: MujocoContact = MujocoContact()) -> float:  # noqa: B008 (frozen)
+def mujoco_bound(share: float, mass: float = 1.65, contact: MujocoContact = MujocoContact()) -> float:  # noqa: B008
     """Return the bound of a transient force in MuJoCo's own contact, relative to the limit F; `mass` is the largest.
 
     This contact is a spring and a damper that act on the acceleration: damping b = 2 / (d τ) and stiffness 1 / (d τ²)
@@ -130,7 +135,7 @@ def mujoco_bound(mass: float = 1.65, contact: MujocoContact = MujocoContact()) -
     """
     d, constant, step = contact.impedance, contact.time_constant, contact.time_step
     per_speed = 2.0 / (d * constant) + step / (d * constant**2)
-    return 1.0 + per_speed * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
+    return impact_ratio(1.0, share) + per_speed * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
 
 
 class Anywhere(Law):

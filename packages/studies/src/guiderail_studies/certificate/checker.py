@@ -33,7 +33,7 @@ COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit 
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec, DECIMAL = 60, 1e-59  # digits of decimal numbers, and their relative rounding error
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
-PEAKS = 1.0, 1.0670197397082735, 1.2984360591922748, 1.6813252024823706  # impacts at 1, 2, 4, 8 times the stiffness
+PEAKS = 1.5, 1.5, 1.5643944629973865, 1.8731779968143014  # impacts at 1, 2, 4, 8 times the stiffness
 SMALLEST, LARGEST, UNDERFLOW = 1e-40, 1e40, 1e-60  # range of a primitive's numbers; bound on errors by underflow
 MAX_BYTES, MAX_WINDOW = 2**30, 500  # largest size of a file's arrays; history and horizon together are less [steps]
 # First halves of the SHA-256 of assumptions: the seven required ones together, that of a budget, that of another period
@@ -410,7 +410,7 @@ def check_forces(impedance: Any, computed: dict[str, Arrays], outputs: int) -> N
 def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
     """Return the claims of a valid certificate, signed with the key if one is given; otherwise raise `Rejected`."""
     p, witness, claims = read(folder, key)
-    require(claims["format"] == "guiderail certificate 6", "wrong format")
+    require(claims["format"] == "guiderail certificate 7", "wrong format")
     require(type(claims["kernel"]) is str and claims["kernel"] in KERNELS, f"the kernel is none of {list(KERNELS)}")
     require(type(claims["about"]) is dict and "task" in claims["about"], "the certificate does not name its task")
     period = Real(numbers(claims["period"], (), "period"))

@@ -17,7 +17,7 @@ from guiderail_studies.certificate.bounds import CertifiedBounds
 from guiderail_studies.certificate.loop import Bounds, CertifiedLoop
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 6"
+FORMAT = "guiderail certificate 7"
 OUTWARD = 1e-5  # margin of all claims for the rounding of primitive and checker, relative to the largest value
 # The checker has digests of these sentences in `ASSUMED`.
 ASSUMPTIONS = (

@@ -85,7 +85,7 @@ inline void slow_down(Vec6& spring, const Vec6& damping, const double* velocity,
     shorten(s, bound.force - std::max(0.0, impedance * speed - product_of(d, velocity) / speed) - impedance * lever * turn);
   const double weight = lever * inertia.mass / inertia.moment;
   if (weight > 0.0 && product_of(t, w) > 0.0) {
-    const double limit = bound.force - norm_of(s) - impedance * speed;
+    const double limit = bound.force - 0.5 * norm_of(s) - impedance * speed;
     shorten(t, (limit - std::max(0.0, impedance * lever * turn - weight * product_of(d + 3, w) / turn)) / weight);
   }
 }
