@@ -86,8 +86,10 @@ def test_page_is_self_contained_with_a_layout_for_phones(page):
     assert '<meta name="viewport" content="width=device-width' in text
     assert "<title>NarrowPassage · kgrl · constant" in text
     assert "@media (max-width: 700px)" in text
+    assert all(words in text for words in ("the constraint", "demonstrations", "transparent</button>"))
     assert "<script src=" not in text
     assert "<link" not in text
+    assert "https://" not in text.partition("<body>")[0]
 
 
 def test_page_links_an_existing_report(page, tmp_path):
