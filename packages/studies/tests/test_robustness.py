@@ -49,6 +49,8 @@ def test_table_is_named_after_the_arguments(run, monkeypatch):
     options = [{}, {"axes": "wall"}, {"environment": {"action_repeat": 2}}, {"episodes": 2}, {"seed": 7}]
     options.append({"baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}})
     monkeypatch.setattr(module, "EPISODES", 1)
+    columns = {"success": [1], "steps": [5], "peak_force": [2.0], "max_commanded_violation": [0.0]}
+    monkeypatch.setattr(module, "evaluate_once", lambda *_, **options: pd.DataFrame(columns))
     tables = [robustness([run], **{"episodes": 1, **each})["table"] for each in options]
     suffixes = ["", "-wall", "-action_repeat=2", "-episodes=2", "-seed=7", "-uniform_random"]
     assert [table.stem for table in tables] == [f"robustness{suffix}" for suffix in suffixes]
