@@ -122,24 +122,22 @@ def test_first_exception_is_raised_when_commands_fail_as_well(make_executor):
     assert "commands that bring the arm to rest could not be sent: write raised OSError" in messages[-1]
 
 
-@pytest.mark.parametrize(
-    ("method", "replacement", "message"),
-    [
+def test_checks_raise_when_the_driver_fails(make_executor, monkeypatch):
+    executor, _ = make_executor()
+    driver, commands = executor._station.driver, []
+    driver.write = lambda *command: commands.append(command)
+    for method, replacement, message in (
         ("read", unplugged, "no status can be read from the driver iiwa: read raised OSError: cable unplugged"),
         ("receive", unplugged, "no status can be read from the driver iiwa: receive raised OSError"),
         ("read", scalar_status, "stays where it is: a status message has the wrong number of joints: check the driver"),
         ("read", lambda: "status", "stays where it is: .* cannot be decoded: check the driver iiwa"),
         ("check_setup", unplugged, "the driver iiwa failed: check_setup raised OSError: cable unplugged"),
-    ],
-)
-def test_checks_raise_when_the_driver_fails(make_executor, method, replacement, message):
-    executor, _ = make_executor()
-    driver, commands = executor._station.driver, []
-    driver.write = lambda *command: commands.append(command)
-    setattr(driver, method, replacement)
-    with pytest.raises(InputError, match=message):
-        executor.preflight.repeat()
-    assert commands == []
+    ):
+        with monkeypatch.context() as patch, pytest.raises(InputError, match=message):
+            patch.setattr(driver, method, replacement)
+            executor.preflight.repeat()
+        assert commands == []
+    executor.preflight.repeat()  # the driver answers again
 
 
 def test_checks_raise_when_statuses_become_malformed(make_executor, monkeypatch):
