@@ -642,7 +642,8 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     text = (other / "task.yaml").read_text()
     (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
     options = *SMALL_LEARNER, "--set", "demonstration_episodes=1", "--no-pictures", "--out", tmp_path / "run"
-    options = *options, "--env", "force_limit=1"  # an episode ends at the first contact
+    # An episode ends at the first contact.
+    options = *options, "--env", "force_limit=1", "--env", "bounded_force=false"
     call("train", folder, other, "--episodes", 2, "--evaluate", 1, *options, "--json")
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out_episodes"] == 2
     run = RunFolder(tmp_path / "run")
