@@ -127,7 +127,7 @@ def shorten_create_task() -> None:
         contact_map.TOUCHES, contact.MIN_SPEED = 4, 0.0
         contact.MISALIGNMENTS = create_task.MISALIGNMENTS = contact.MISALIGNMENTS[:1]
         trial.add_convex_pieces = lambda folder, file, *_: file
-        mixture._MAX_COMPONENTS = 4
+        mixture._MAX_COMPONENTS = 1
         difficulty.score_setting = lambda *_: difficulty.Score(0, 1, 1, 1)
 
 

@@ -24,7 +24,7 @@ def test_table_has_results_and_failures_and_is_continued(tmp_path, capsys, monke
     monkeypatch.setattr(demonstrator, "_ANGLES", demonstrator._ANGLES[:3])  # three demonstrations
     monkeypatch.setattr(demonstrator, "NUM_DEMONSTRATIONS", 3)
     monkeypatch.setattr(contact_map, "TOUCHES", 4)
-    monkeypatch.setattr(mixture, "_MAX_COMPONENTS", 4)
+    monkeypatch.setattr(mixture, "_MAX_COMPONENTS", 1)
     monkeypatch.setattr(contact, "MAX_TRIALS", 1)
     monkeypatch.setattr(contact, "MIN_SPEED", 0.0)  # no further trials on a slow machine
     meshes, out = tmp_path / "meshes", tmp_path / "parts"
