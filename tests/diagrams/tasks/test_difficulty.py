@@ -104,6 +104,14 @@ def test_scripted_policy_locks_at_hard_and_zero_policy_fails(connector):
     assert not evaluate_policy(connector, zero_policy(connector), episodes=1, **NEW_RUN)["success"].any()
 
 
+def test_pressed_bayonet_is_turned_by_a_robot_with_twice_the_stiffness():
+    """The spring presses with nearly the whole force bound, along z and on the wall of the bore."""
+    env = make_env("BncConnector", guidance="kgrl", difficulty="hard", disturbances={"stiffness_factor": 2.0})
+    row = evaluate_policy(env, scripted_center_of_pressure, episodes=1, **NEW_RUN).iloc[0]
+    assert row["success"]
+    assert row["peak_force"] > 0.7 * env.diagram.task.force_limit
+
+
 def test_fast_search_succeeds_at_hard_and_descent_fails(clamp):
     assert evaluate_policy(clamp, scripted_fast_search, episodes=3, **NEW_RUN)["success"].all()
     assert not evaluate_policy(clamp, straight_descent, episodes=1, **NEW_RUN)["success"].any()
