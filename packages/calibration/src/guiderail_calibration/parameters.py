@@ -39,7 +39,6 @@ class Parameter:
 
 
 _AXES = {axis.name: axis for axis in AXES}
-# Robots that a lab would use: none loses a third of its commands or answers 60 ms late.
 PARAMETERS = tuple(
     Parameter(_AXES[name], low, high, scale)
     for name, low, high, scale in (
@@ -50,10 +49,10 @@ PARAMETERS = tuple(
         ("wrench_scale", 0.5, 2.0, "log"),
         ("wrench_bias", 0.0, 4.0, "linear"),
         ("wrench_noise", 0.02, 1.0, "log"),
-        ("wrench_delay", 1, 5, "integer"),
+        ("wrench_delay", 1, 8, "integer"),
         ("pose_bias", 0.0, 1.0, "linear"),
-        ("lost", 0.0, 0.1, "linear"),
-        ("late", 0, 3, "integer"),
+        ("lost", 0.0, 0.4, "linear"),
+        ("late", 0, 6, "integer"),
         ("payload", 0.0, 1.0, "linear"),
         ("joint_friction", 0.0, 1.0, "linear"),
     )
