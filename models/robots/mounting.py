@@ -25,7 +25,6 @@ from guiderail.models.common.parsing import add_models
 from guiderail.models.robots.robot import EndEffector, JointDrives, Robot
 
 SLIP = 1e-3  # speed above which a joint's friction is constant [rad/s]
-TINY_STIFFNESS = 1e-12  # of joint friction [Nm/rad], because Drake requires a positive one
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def add_joint_friction(plant: MultibodyPlant, actuators: Sequence[JointActuator]
     """
     for actuator in actuators:
         friction = plant.AddJointActuator(f"{actuator.name()}_friction", actuator.joint(), torque)
-        friction.set_controller_gains(PdControllerGains(p=TINY_STIFFNESS, d=torque / SLIP))
+        friction.set_controller_gains(PdControllerGains(p=0.0, d=torque / SLIP))
         # Drake uses the reflected inertia of a joint's last actuator only.
         friction.set_default_rotor_inertia(actuator.default_rotor_inertia())
         friction.set_default_gear_ratio(actuator.default_gear_ratio())
