@@ -242,7 +242,7 @@ class ArmStation(Station):
         )
         if joint_friction:
             n = torque.size()
-            torque = add_system(builder, "without_friction", MatrixGain(np.eye(2 * n, n)), torque).get_output_port()
+            torque = add_system(builder, "torque_and_friction", MatrixGain(np.eye(2 * n, n)), torque).get_output_port()
             at_rest = builder.AddNamedSystem("friction_at_rest", ConstantVectorSource(np.zeros(4 * n)))
             builder.Connect(at_rest.get_output_port(), plant.get_desired_state_input_port(arm.model))
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))

@@ -36,7 +36,6 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
 from guiderail.models.control.wrench import FORCE_SHARES, impact_ratio
 from guiderail.models.laws.law import Command, Law
-from guiderail.models.robots.robot import find_robot
 from guiderail_mujoco.station import MujocoContact
 
 ANYWHERE = "anywhere"  # registered name of `Anywhere`
@@ -253,10 +252,11 @@ def held_force(env: Any, joint_friction: float) -> float:
     station = station_of(env)
     plant, arm = station.plant, station.arm
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
-    world, first = plant.world_frame(), plant.GetJointByName(find_robot("iiwa14").joints[0]).velocity_start()
+    world = plant.world_frame()
     jacobian = plant.CalcJacobianTranslationalVelocity(
         context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), world, world
-    )[:, first : first + plant.num_velocities(arm.model)]
+    )
+    jacobian = np.stack([plant.GetVelocitiesFromArray(arm.model, row) for row in jacobian])
     directions = np.random.default_rng(0).standard_normal((4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return float((joint_friction / np.abs(directions @ jacobian).max(axis=1)).max())
