@@ -102,6 +102,22 @@ def test_calibration_is_resumed_and_writes_its_files(tmp_path, monkeypatch):
     assert again["parameters"] == result["parameters"]
 
 
+def test_without_recordings_the_variants_are_draws_of_the_prior(tmp_path, capsys):
+    command = ["calibrate", RUN, "--env", "station=gantry", "--variants", "3", "--out", str(tmp_path)]
+    with pytest.raises(SystemExit) as exit_info:
+        main(command)
+    assert not exit_info.value.code
+    stored = load_variants(tmp_path / "variants.yaml")
+    stiffness = [variant["disturbances.stiffness_factor"] for variant in stored.values()]
+    assert len(set(stiffness)) == 3
+    assert all(0.5 <= value <= 2.0 for value in stiffness)
+    assert {variant["station"] for variant in stored.values()} == {"gantry"}
+    with pytest.raises(SystemExit) as exit_info:
+        main([*command, "--probe", str(tmp_path / "probe.npz")])
+    assert exit_info.value.code == 2
+    assert "give --recordings too" in capsys.readouterr().err
+
+
 def test_task_without_demonstrations_from_a_file_is_not_probed(tmp_path):
     with pytest.raises(InputError, match="GridClamp takes no demonstrations from a file"):
         record_options("pretrained:clamp", {}, tmp_path / "probe.npz")

@@ -39,7 +39,7 @@ MIN_DRAWS = 40
 SAMPLES = 2000  # draws of the posterior
 PREDICTED = 40  # default number of draws of the posterior for which the policy is simulated
 EPISODES_OF_PREDICTION = 4  # episodes of each of these draws
-VARIANTS = 10  # number of variants of the environment
+VARIANTS = 10  # default number of variants of the environment
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ def calibrate(
     parameters: Sequence[str] | None = None,
     draws: int = DRAWS,
     predicted: int = PREDICTED,
+    number: int = VARIANTS,
     out: Path | None = None,
     processes: int | None = None,
     log: Callable[[str], None] = lambda sentence: None,
@@ -116,6 +117,7 @@ def calibrate(
         parameters: Names of the parameters; None for all that the environment has.
         draws: Number of simulated draws of the prior, at least `MIN_DRAWS`.
         predicted: Number of draws of the posterior for which the policy is simulated; 0 for no prediction.
+        number: Number of variants of the environment.
         out: Folder to write; by default `calibration` in the run.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
         log: Function called with sentences on sensitivities.
@@ -128,6 +130,7 @@ def calibrate(
     """
     draws = as_whole(draws, "the number of draws of the prior", MIN_DRAWS)
     predicted = as_whole(predicted, "the number of draws of a prediction", 0)
+    number = as_whole(number, "the number of variants", 1, SAMPLES)
     processes = check_processes(processes)
     subject, out = find_run(run, environment, out, "calibration")
     config = subject.config
@@ -165,7 +168,39 @@ def calibrate(
         selected, left_out, posterior.sensitivities, posterior.identifiable, quantiles, p_value, is_explained,
         prediction, episodes, shown,
     )  # fmt: skip
-    return calibration.result() | _write(out, config.task, base, calibration)
+    return calibration.result() | _write(out, config.task, base, calibration, number)
+
+
+def write_prior_variants(
+    run: Path | str,
+    number: int,
+    *,
+    environment: Mapping[str, Any] | None = None,
+    parameters: Sequence[str] | None = None,
+    out: Path | None = None,
+) -> Path:
+    """Write variants of a run's environment with draws of the prior, to train for robots without recordings.
+
+    Args:
+        run: Folder of a run, or `pretrained:NAME`.
+        number: Number of variants.
+        environment: Options of the environment that differ from training, such as the station.
+        parameters: Names of the parameters; None for all that the environment has.
+        out: Folder to write; by default `calibration` in the run.
+
+    Returns:
+        Path of the file of variants.
+
+    Raises:
+        InputError: If an argument is invalid, or the run has no folder and `out` is None.
+    """
+    number = as_whole(number, "the number of variants", 1, SAMPLES)
+    subject, out = find_run(run, environment, out, "calibration")
+    config = subject.config
+    assert config is not None  # a run has one
+    base = subject.changed_environment(dict(environment or {}))
+    selected, _ = select_parameters(config.task, base, parameters)
+    return _write_variants(out, config.task, base, selected, draw_prior(number, len(selected)))
 
 
 def fit(simulated: Sequence[Simulated], num_steps: int, episodes: int) -> Posterior:
@@ -177,7 +212,7 @@ def fit(simulated: Sequence[Simulated], num_steps: int, episodes: int) -> Poster
 def variants(
     task: str, environment: Mapping[str, Any], parameters: Sequence[Parameter], quantiles: np.ndarray
 ) -> dict[str, dict[str, Any]]:
-    """Return variants of an environment, one for each of the draws (n, d) of the posterior, for `train --variants`.
+    """Return variants of an environment, one for each draw (n, d) of posterior or prior, for `train --variants`.
 
     A variant has the disturbances of one draw; all draws are equally likely.
     """
@@ -191,15 +226,24 @@ def _digest(quantiles: np.ndarray) -> str:
     return hashlib.blake2b(np.round(quantiles, 6).tobytes(), digest_size=4).hexdigest()
 
 
-def _write(out: Path, task: str, environment: Mapping[str, Any], calibration: Calibration) -> dict[str, str]:
+def _write(
+    out: Path, task: str, environment: Mapping[str, Any], calibration: Calibration, number: int
+) -> dict[str, str]:
     """Write the results into a folder; return the paths of page, table of draws and variants."""
     columns = {p.name: p.value(calibration.quantiles[:, i]) for i, p in enumerate(calibration.parameters)}
     rows = [dict(zip(columns, map(float, values), strict=True)) for values in zip(*columns.values(), strict=True)]
     table = write_table(out / "posterior", rows).with_suffix(".csv")
-    file = out / "variants.yaml"
-    made = variants(task, environment, calibration.parameters, calibration.quantiles[-VARIANTS:])
-    plain = json.loads(json.dumps(made, default=np.generic.item))  # YAML has neither tuples nor numbers of NumPy
-    write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())
+    file = _write_variants(out, task, environment, calibration.parameters, calibration.quantiles[-number:])
     write_atomically(out / "calibration.json", json.dumps(calibration.result(), indent=1).encode())
     write_atomically(out / "calibration.html", render(task, calibration).encode())
     return {"page": str(out / "calibration.html"), "posterior": str(table), "variants": str(file)}
+
+
+def _write_variants(
+    out: Path, task: str, environment: Mapping[str, Any], parameters: Sequence[Parameter], quantiles: np.ndarray
+) -> Path:
+    made = variants(task, environment, parameters, quantiles)
+    plain = json.loads(json.dumps(made, default=np.generic.item))  # YAML has neither tuples nor numbers of NumPy
+    file = out / "variants.yaml"
+    write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())
+    return file

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
 
@@ -15,8 +16,12 @@ Run = Annotated[str, argument("Folder of a run, or pretrained:NAME ({pretrained}
 def calibrate(
     run: Run,
     recordings: Annotated[
-        Path, option("Folder of recorded episodes: a step log, as evaluate --steps writes it, or a run with one.")
-    ],
+        Path | None,
+        option(
+            "Folder of recorded episodes: a step log, as evaluate --steps writes it, or a run with one.  [default: "
+            "none; then only variants.yaml is written, with draws of the prior]"
+        ),
+    ] = None,
     probe: Annotated[
         Path | None, option("Probing motion that was recorded.  [default: episodes of the run's policy]")
     ] = None,
@@ -28,6 +33,7 @@ def calibrate(
     predicted: Annotated[
         int, option("Number of draws of the posterior for which the policy is simulated; 0 for no prediction.")
     ] = 40,
+    variants: Annotated[int, option("Number of variants of the environment in variants.yaml.")] = 10,
     out: Annotated[Path | None, option("Folder to write.  [default: calibration in the run]")] = None,
     processes: cli.Processes = None,
     trust_imports: cli.TrustImports = False,
@@ -41,16 +47,25 @@ def calibrate(
     TASK --variants FILE --set init_from=RUN. Simulations are stored, so the same command resumes.
     """
     from guiderail_calibration.calibrate import calibrate as run_calibration
+    from guiderail_calibration.calibrate import write_prior_variants
     from guiderail_calibration.inference import describe_check
 
+    names = None if parameters is None else [name.strip() for name in parameters.split(",") if name.strip()]
+    if recordings is None:
+        if probe is not None:
+            raise InputError("--probe is a recorded motion: give --recordings too")
+        file = write_prior_variants(run, variants, environment=cli.parse_environment(env), parameters=names, out=out)
+        print_result({"variants": str(file)}, as_json)
+        return
     result = run_calibration(
         run,
         recordings,
         probe=probe,
         environment=cli.parse_environment(env),
-        parameters=None if parameters is None else [name.strip() for name in parameters.split(",") if name.strip()],
+        parameters=names,
         draws=draws,
         predicted=predicted,
+        number=variants,
         out=out,
         processes=processes,
         log=print_message,
