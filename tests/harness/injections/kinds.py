@@ -435,7 +435,7 @@ KINDS = (
     Kind("velocity drift 5 rad/s²", HEARTBEAT, _changed(V, lambda v, t: v + 5.0 * t, single_joint=True)),
     Kind("position + 0.01 rad", NEXT, _changed(Q, lambda q, t: q + 0.01, single_joint=True)),
     Kind("position + 1 rad", NEXT, _changed(Q, lambda q, t: q + 1.0, single_joint=True)),
-    Kind("position drift 9 mrad/s", 140 * PERIOD, _changed(Q, lambda q, t: q + 9e-3 * t, single_joint=True)),
+    Kind("position drift 9 mrad/s", 160 * PERIOD, _changed(Q, lambda q, t: q + 9e-3 * t, single_joint=True)),
     Kind("position drift 0.1 rad/s", FEW, _changed(Q, lambda q, t: q + 0.1 * t, single_joint=True)),
     Kind("position drift 1 rad/s", NEXT, _changed(Q, lambda q, t: q + 1.0 * (t + PERIOD), single_joint=True)),
     Kind("positions swapped", NEXT, _swapped(Q)),

@@ -88,7 +88,7 @@ def test_thresholds_have_their_documented_values():
     assert (module.MIN_MOTION, module.MIN_SPEED) == (1e-4, 0.02)
     assert (module.MAX_EQUAL_POSITIONS, module.MAX_EQUAL_VELOCITIES, module.MAX_EQUAL_STATUSES) == (2, 4, 4)
     assert (module.MODEL_ERROR, module.SENSOR_ERROR, module.EXTERNAL_STEP) == (0.3, 0.1, 2.0)
-    assert (module.LAG, module.DELAY, module.REACTION) == (1.0, 2.0, 1.5)
+    assert (module.LAG, module.MAX_ACCELERATION, module.DELAY, module.REACTION) == (1.0, 10.0, 2.0, 1.5)
     assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME) == (6.0, 1.0, 0.05)
 
 
@@ -522,6 +522,25 @@ def test_slow_drift_of_a_position_is_detected(rate, is_fault, joint):
             break
     assert (fault == Fault.INCONSISTENT) == is_fault
     assert not is_fault or abs(drifted) < 2.5 * limit
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+@pytest.mark.parametrize("rate", [-0.009, 0.009, 0.0])
+def test_drift_is_detected_while_velocities_change(rate, is_late):
+    """The joints accelerate by up to 8 rad/s²; the velocities may be a period late."""
+    rig, count, fault = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle(), 0, Fault.NONE
+    while count * PERIOD < 4.0 and not fault:
+        count += 1
+        before, torque = rig.v, M @ np.array([8.0, 6.0]) * np.cos(20.0 * count * PERIOD)
+        shift = np.array([0.0, count * rate * PERIOD])
+        fault = rig.check(
+            lambda true, shift=shift, late=before: replace(
+                true, positions=true.positions + shift, velocities=late if is_late else true.velocities
+            ),
+            torque,
+        )
+    assert fault == (Fault.INCONSISTENT if rate else Fault.NONE)
+    assert not rate or count * PERIOD < 1.0
 
 
 def test_noise_is_no_drift():
@@ -1123,7 +1142,7 @@ def test_velocity_in_doubt_is_limited_to_the_prediction(reported, expected):
 
 
 def test_initial_state_is_zero_without_statuses():
-    expected = np.zeros(13 + 26 * 2)
+    expected = np.zeros(13 + 27 * 2)
     expected[2] = Fault.NO_STATUS
     expected[[4, 5, 9, 11]] = np.nan
     np.testing.assert_array_equal(EstimatorState.initial(2).vector(), expected)
@@ -1136,7 +1155,7 @@ def test_state_is_restored_from_its_vector():
     np.testing.assert_array_equal(restored.vector(), rig.state.vector())
     np.testing.assert_array_equal(restored.bias, rig.state.bias)
     assert (restored.doubt_time, restored.last_time) == (rig.state.doubt_time, rig.state.last_time)
-    assert EstimatorState.initial(3).vector().shape == (13 + 26 * 3,)
+    assert EstimatorState.initial(3).vector().shape == (13 + 27 * 3,)
 
 
 def test_torque_that_is_not_finite_counts_as_zero():
@@ -1247,14 +1266,14 @@ def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
 
 
 RECORDED = {
-    0: [-27271.439982213, -27134.732761759, -27200.063405006, -27331.915689629, -27294.305631505,
-        -27381.209878544, -27172.55544922, -26983.111667375, -27109.488200351, -27244.352285977],
-    1: [-27168.808517547, -27213.381891921, -27273.587714397, -27301.481475501, -27305.604409814,
-        -27397.677519763, -27257.404417387, -27256.005652192, -27238.373823735, -27307.961859428],
-    2: [-27112.681234832, -27301.899535665, -27243.488337545, -27232.260998596, -27081.489316911,
-        -27231.452907326, -27224.838597197, -27189.367388434, -27211.320069274, -27196.052989736],
-    3: [-27224.57341375, -27060.015000488, -26918.639978285, -26947.008711994, -27017.071473828,
-        -27188.734308, -27144.32235942, -27060.861307233, -27255.420077551, -27259.88426524],
+    0: [-27271.374063951, -27134.202979802, -27198.693613528, -27330.601053791, -27292.908000999,
+        -27379.863800089, -27171.200951628, -26982.534945857, -27108.497072845, -27243.020334567],
+    1: [-27168.797113421, -27213.385763427, -27273.573776978, -27301.490654482, -27305.587884011,
+        -27397.677519763, -27257.386969681, -27255.984435497, -27238.35260704, -27307.930086461],
+    2: [-27112.515924021, -27301.12818726, -27242.440014289, -27231.988050578, -27081.115548725,
+        -27231.134379657, -27224.527892353, -27189.069589694, -27211.103999241, -27195.715794451],
+    3: [-27224.540363784, -27060.002930922, -26918.639855962, -26947.013900541, -27017.024062841,
+        -27188.739994946, -27144.295886196, -27060.795742129, -27255.408256834, -27259.869688855],
 }  # fmt: skip
 
 

@@ -46,6 +46,7 @@ MAX_EQUAL_STATUSES = 4  # number of repetitions of all values of a joint that is
 MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
 EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
 LAG = 1.0  # largest delay of a velocity's filter [periods]
+MAX_ACCELERATION = 10.0  # of a joint without a jump of its velocity [rad/s²]
 DELAY = 2.0  # largest time from a command or a contact to its effect on torques [periods]
 REACTION = 1.5  # accepted change of velocity that no torque explains, relative to the measured change
 MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
@@ -107,6 +108,7 @@ class EstimatorState(NamedTuple):  # of which each check makes many copies, whic
     tolerance: np.ndarray
     bias: np.ndarray  # learned constant error of the torques, (n,) [Nm]
     drift: np.ndarray  # like `residual`, with the decay time `DRIFT_WINDOW`, (n,) [rad]
+    swing: np.ndarray  # recent change of the velocity, with the same decay time and without jumps, (n,) [rad/s]
     pulse: np.ndarray  # impulse of the commanded torques since the last status, (n,) [Nms]
     other_pulse: np.ndarray  # impulse of all other torques since the last status, (n,) [Nms]
     pulse_error: np.ndarray  # largest error of the two together, (n,) [Nms]
@@ -128,7 +130,7 @@ class EstimatorState(NamedTuple):  # of which each check makes many copies, whic
         return cls(*vector[:NUM_SCALARS].tolist(), *values, *vectors)
 
     def vector(self) -> np.ndarray:
-        """Return the state as one vector, (13 + 26 n,)."""
+        """Return the state as one vector, (13 + 27 n,)."""
         return np.concatenate([self[:NUM_SCALARS], *self[NUM_SCALARS:]])
 
     def shifted(self, seconds: float) -> "EstimatorState":
@@ -173,8 +175,9 @@ class StateEstimator:
       positions or velocities of the joint. While one joint moves, no other joint repeats all of position, velocity and
       external torque.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses with the velocities v₋ and v and
-      the time h between them. The sum of deviations, with a decay, is within the position tolerance, and with a slower
-      decay within `MAX_DRIFT` of these tolerances.
+      the time h between them. The sum of deviations, with a decay, is within the position tolerance. With a slower
+      decay, the sum of Δq − h (v₋ + v) / 2 differs from λ Σ (v − v₋), the effect of a velocity filter with a delay λ of
+      0 to `LAG` periods, by at most `MAX_DRIFT` of these tolerances; only jumps of the velocity extend this.
     - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay, and the time h
       between two checks,
       |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
@@ -409,15 +412,18 @@ class StateEstimator:
         if not is_fresh or check_status(status, accepted, now, self._limits) != Fault.NONE:
             return False
         values = status.values()
-        deviation = self._deviation(values, values - accepted.values, elapsed)
+        change = values - accepted.values
+        deviation = self._deviation(values, change, elapsed, change[self._velocities])
         is_moving_as_predicted = np.abs(values[self._velocities] - state.velocity) <= AGREEMENT
         return bool((is_moving_as_predicted & (np.abs(deviation) <= self._limits.position_tolerance)).all())
 
-    def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float) -> np.ndarray:
-        """Return the part of each position's change that the velocities do not explain, (n,) [rad]."""
-        acceleration = change[self._velocities]
-        error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * acceleration)
-        return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(acceleration), 0.0)
+    def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float, late: np.ndarray) -> np.ndarray:
+        """Return the part of each position's change that the velocities do not explain, (n,) [rad].
+
+        `late` (n,) is the part of their change that may be reported late [rad/s].
+        """
+        error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * change[self._velocities])
+        return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(late), 0.0)
 
     def _update_positions(
         self, state: EstimatorState, values: np.ndarray, change: np.ndarray, elapsed: float
@@ -428,10 +434,14 @@ class StateEstimator:
         moved = (np.abs(change[self._positions]) - 2.0 * RESOLUTION) / elapsed
         equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
-        deviation = self._deviation(values, change, elapsed)
+        acceleration, largest = change[self._velocities], MAX_ACCELERATION * self._period
+        smooth = np.clip(acceleration, -largest, largest)
+        residual = self._deviation(values, change, elapsed, acceleration)
+        drift = self._deviation(values, change, elapsed, acceleration - smooth)
         return state._replace(
-            residual=np.exp(-elapsed / POSITION_WINDOW) * state.residual + deviation,
-            drift=np.exp(-elapsed / DRIFT_WINDOW) * state.drift + deviation,
+            residual=np.exp(-elapsed / POSITION_WINDOW) * state.residual + residual,
+            drift=np.exp(-elapsed / DRIFT_WINDOW) * state.drift + drift,
+            swing=np.exp(-elapsed / DRIFT_WINDOW) * state.swing + smooth,
             equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
             equal_velocities=np.where(equal_velocities, state.equal_velocities + 1.0, 0.0),
             equal_values=np.where(equal_values, state.equal_values + 1.0, 0.0),
@@ -440,7 +450,9 @@ class StateEstimator:
     def _restart(self, state: EstimatorState) -> EstimatorState:
         """Return the state with the comparisons of consecutive statuses reset."""
         zero = self._zeros
-        return state._replace(residual=zero, drift=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
+        return state._replace(
+            residual=zero, drift=zero, swing=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero
+        )
 
     def _update_momentum(
         self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
@@ -500,7 +512,9 @@ class StateEstimator:
         if any((count >= limit).any() for count, limit in counts):
             return Fault.FROZEN
         tolerance = self._limits.position_tolerance
-        if (np.abs(state.residual) > tolerance).any() or (np.abs(state.drift) > MAX_DRIFT * tolerance).any():
+        late = LAG * self._period * state.swing
+        drift = state.drift - np.clip(state.drift, np.minimum(late, 0.0), np.maximum(late, 0.0))
+        if (np.abs(state.residual) > tolerance).any() or (np.abs(drift) > MAX_DRIFT * tolerance).any():
             return Fault.INCONSISTENT
         if is_contradictory or (state.excess > MAX_EXCESS).any():
             return Fault.NOT_REACTING
