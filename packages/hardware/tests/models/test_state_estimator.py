@@ -89,7 +89,7 @@ def test_thresholds_have_their_documented_values():
     assert (module.MAX_EQUAL_POSITIONS, module.MAX_EQUAL_VELOCITIES, module.MAX_EQUAL_STATUSES) == (2, 4, 4)
     assert (module.MODEL_ERROR, module.SENSOR_ERROR, module.EXTERNAL_STEP) == (0.3, 0.1, 2.0)
     assert (module.LAG, module.MAX_ACCELERATION, module.DELAY, module.REACTION) == (1.0, 10.0, 2.0, 1.5)
-    assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME) == (6.0, 1.0, 0.05)
+    assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME, module.REST_SPEED) == (6.0, 1.0, 0.05, 0.05)
 
 
 def test_valid_status_is_accepted_at_once():
@@ -1141,6 +1141,19 @@ def test_velocity_in_doubt_is_limited_to_the_prediction(reported, expected):
 # State and arguments.
 
 
+@pytest.mark.parametrize(("velocity", "is_learned"), [(0.4, False), (0.0, True)])
+def test_bias_is_learned_without_torque_only_at_rest(velocity, is_learned):
+    """A bias from wrong velocities of a moving arm would cancel the damping of the stop."""
+    rig = Rig(velocity=np.array([velocity, 0.0]), external=np.zeros(2)).settle()
+    for _ in range(4):
+        rig.check(torque=np.zeros(2))
+    before = rig.state.bias
+    error = 0.04 if is_learned else 0.3
+    for sign in (1.0, -1.0, 1.0):
+        rig.check(shifted(velocities=[sign * error, 0.0]), np.zeros(2))
+    assert (np.abs(rig.state.bias - before).max() > 0.1) == is_learned
+
+
 def test_initial_state_is_zero_without_statuses():
     expected = np.zeros(13 + 27 * 2)
     expected[2] = Fault.NO_STATUS
@@ -1266,14 +1279,14 @@ def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
 
 
 RECORDED = {
-    0: [-27271.374063951, -27134.202979802, -27198.693613528, -27330.601053791, -27292.908000999,
-        -27379.863800089, -27171.200951628, -26982.534945857, -27108.497072845, -27243.020334567],
-    1: [-27168.797113421, -27213.385763427, -27273.573776978, -27301.490654482, -27305.587884011,
-        -27397.677519763, -27257.386969681, -27255.984435497, -27238.35260704, -27307.930086461],
-    2: [-27112.515924021, -27301.12818726, -27242.440014289, -27231.988050578, -27081.115548725,
-        -27231.134379657, -27224.527892353, -27189.069589694, -27211.103999241, -27195.715794451],
-    3: [-27224.540363784, -27060.002930922, -26918.639855962, -26947.013900541, -27017.024062841,
-        -27188.739994946, -27144.295886196, -27060.795742129, -27255.408256834, -27259.869688855],
+    0: [-27271.484989789, -27137.741892022, -27203.168898345, -27335.442517311, -27298.095483367,
+        -27385.832529337, -27172.839873214, -26984.167509258, -27110.134717454, -27244.659938027],
+    1: [-27170.506093227, -27187.657663278, -27242.331708183, -27213.036035511, -27186.315753029,
+        -27312.021937075, -27176.700103995, -27195.537987847, -27138.577349586, -27260.965311934],
+    2: [-27112.795660861, -27302.199895061, -27243.32119322, -27232.96877637, -27082.168358039,
+        -27232.223025558, -27225.708810652, -27189.990821054, -27212.042674923, -27196.731702612],
+    3: [-27225.647489982, -27066.391298954, -26926.215283725, -26983.606809246, -27027.995955951,
+        -27194.597687539, -27151.09179085, -27068.105670786, -27262.864550362, -27267.61532802],
 }  # fmt: skip
 
 

@@ -51,6 +51,7 @@ DELAY = 2.0  # largest time from a command or a contact to its effect on torques
 REACTION = 1.5  # accepted change of velocity that no torque explains, relative to the measured change
 MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
 BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time constants of the learned bias with and without commanded torque [s]
+REST_SPEED = 0.05  # speed up to which the bias is learned without commanded torque [rad/s]
 SCALE_WINDOW, MAX_EXCESS = (
     0.1,
     0.35,
@@ -269,8 +270,11 @@ class StateEstimator:
         if is_comparable and not is_doubted and state.torque.any():
             state = self._update_momentum(state, M, change[self._velocities], elapsed)
         else:
-            # The momentum sums start again at this status.
-            is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
+            # The momentum sums start again at this status. From a wrong velocity of a moving arm, a bias would be learned
+            # that cancels the damping.
+            speeds = (before.velocity, last.values[self._velocities], values[self._velocities])
+            is_resting = np.abs(speeds).max() <= REST_SPEED
+            is_learning = is_comparable and is_resting and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         state = state._replace(pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
         deviation, explained, allowed = self._momentum_deviation(state, M)
