@@ -270,8 +270,8 @@ class StateEstimator:
         if is_comparable and not is_doubted and state.torque.any():
             state = self._update_momentum(state, M, change[self._velocities], elapsed)
         else:
-            # The momentum sums start again at this status. From a wrong velocity of a moving arm, a bias would be learned
-            # that cancels the damping.
+            # The momentum sums start again at this status. A bias that is learned from a wrong velocity of a moving arm
+            # would cancel the damping.
             speeds = (before.velocity, last.values[self._velocities], values[self._velocities])
             is_resting = np.abs(speeds).max() <= REST_SPEED
             is_learning = is_comparable and is_resting and not state.torque.any() and not before.tolerance.any()
