@@ -55,6 +55,7 @@ class FciDriver(PoseDriver):
     hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause
     # A fifth of the robot's linear and four fifths of its angular velocity, and half of its accelerations and jerks. A
     # single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
+    is_spring_and_damper = True
     motion_limits = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 
     def __init__(self, url: str = "", *, client: Any = None):
