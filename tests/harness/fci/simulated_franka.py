@@ -1,4 +1,4 @@
-"""Checks of a simulated Franka over its own protocol: insertion, lock, stop, loss of the robot, and reflex.
+"""Checks of a simulated Franka over its own protocol: insertion, lock, stop, unlock, loss of the robot, and reflex.
 
 `make fci` runs the checks in an environment with franky and franky-sim. The robot is a separate process that answers
 libfranka's network protocol. Robot and station advance in lockstep, so the speed of the machine does not matter.
@@ -109,6 +109,13 @@ def run_checks() -> list[str]:
         check("stop", run["arm_state"][0] == ArmState.OFF, run.describe())
         run.resume()
         check("resume", run["arm_state"][0] == ArmState.RUNNING, run.describe())
+        # Back to the start: a robot that replaces this one is only followed in the last posture.
+        run.advance((run.pose[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
+        run.advance((START[3] - run.pose[3]) / TURN, np.array([0.0, 0.0, 0.0, TURN, 0.0, 0.0]))
+        run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, DOWN, 0.0, 0.0, 0.0]))
+        run.advance(0.3)
+        height, turn = run["pose"][2] - START[2], run["pose"][3] - START[3]
+        check("unlock", abs(height) < 1e-3 and abs(turn) < np.deg2rad(8.0), run.describe())
         robot.kill()
         run.advance(0.6)
         check(
