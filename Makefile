@@ -86,6 +86,7 @@ fci:  ## run a Franka on the simulator of its protocol, minutes
 	$(PYTHON) -m venv .venv-fci
 	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn]" -e "packages/hardware[fci]" -e packages/mujoco franky-sim
 	.venv-fci/bin/python tests/harness/fci/simulated_franka.py
+	.venv-fci/bin/python tests/harness/fci/forces.py --steps 600
 
 lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its own, minutes (downloads 4 GB)
 	python3.12 -m venv .venv-lerobot

@@ -132,9 +132,13 @@ def mujoco_bound(share: float, mass: float = 1.65, contact: MujocoContact = Mujo
     of a unit mass. At the approach speed F / (2 √(k m)) its damper decides. A step h before, the depth is at most the
     speed times h.
     """
-    d, constant, step = contact.impedance, contact.time_constant, contact.time_step
-    per_speed = 2.0 / (d * constant) + step / (d * constant**2)
-    return impact_ratio(1.0, share) + per_speed * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
+    return impact_ratio(1.0, share) + mujoco_damping(contact) * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
+
+
+def mujoco_damping(contact: MujocoContact) -> float:
+    """Return the force of an impact in MuJoCo's own contact per mass and speed [1/s]; see `mujoco_bound`."""
+    d, constant = contact.impedance, contact.time_constant
+    return 2.0 / (d * constant) + contact.time_step / (d * constant**2)
 
 
 class Anywhere(Law):
@@ -245,7 +249,7 @@ def station_of(env: Any) -> Any:
 def held_force(env: Any, joint_friction: float) -> float:
     """Return the largest force at the tool center [N] against which an arm's joints at rest need no more than friction.
 
-    In the direction u, the joint with the largest lever arm slips first: min over joints of friction / |Jᵀ u|.
+    See `friction_force`.
     """
     if joint_friction == 0.0:
         return 0.0
@@ -256,7 +260,15 @@ def held_force(env: Any, joint_friction: float) -> float:
     jacobian = plant.CalcJacobianTranslationalVelocity(
         context, JacobianWrtVariable.kV, arm.tool_center, np.zeros(3), world, world
     )
-    jacobian = np.stack([plant.GetVelocitiesFromArray(arm.model, row) for row in jacobian])
+    return friction_force(np.stack([plant.GetVelocitiesFromArray(arm.model, row) for row in jacobian]), joint_friction)
+
+
+def friction_force(jacobian: np.ndarray, joint_friction: float) -> float:
+    """Return the largest force at the tool center [N] that the friction of an arm's joints [Nm] holds.
+
+    In the direction u, the joint with the largest lever arm slips first: min over joints of friction / |Jᵀ u|, with the
+    Jacobian J (3, n) of the tool center's position.
+    """
     directions = np.random.default_rng(0).standard_normal((4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return float((joint_friction / np.abs(directions @ jacobian).max(axis=1)).max())

@@ -1,4 +1,4 @@
-"""Checks of a simulated Franka over its own protocol: insertion, lock, stop, loss of the robot, and reflex.
+"""Checks of a simulated Franka over its own protocol: insertion, lock, stop, unlock, loss of the robot, and reflex.
 
 `make fci` runs the checks in an environment with franky and franky-sim. The robot is a separate process that answers
 libfranka's network protocol. Robot and station advance in lockstep, so the speed of the machine does not matter.
@@ -18,6 +18,7 @@ from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware.drivers.fci import FciDriver
 from guiderail_hardware.drivers.fci_lockstep import FciLockstepClock
 from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault
+from guiderail_hardware.models.state_estimator import SOURCE_TIME
 from guiderail_hardware.robot.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent
 from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation
@@ -31,12 +32,12 @@ LOW_THRESHOLDS = (6.0, 5.0)  # collision thresholds below the loads of the inser
 
 
 class SimulatedRun:
-    """Hardware station connected to the simulated robot."""
+    """Hardware station connected to the simulated robot, with a bound of the impedance force [N]."""
 
-    def __init__(self, driver: type[FciDriver] = FciDriver):
+    def __init__(self, driver: type[FciDriver] = FciDriver, force_limit: float = FORCE_LIMIT):
         self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
         self.station = HardwareStation(
-            BncWorkcell(), driver(self.host), Impedance().with_max_force(FORCE_LIMIT), robot="panda", robot_timeout=60.0
+            BncWorkcell(), driver(self.host), Impedance().with_max_force(force_limit), robot="panda", robot_timeout=60.0
         )
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
@@ -59,8 +60,11 @@ class SimulatedRun:
             self.max_force = max(self.max_force, float(self["impedance_force"][0]))
 
     def resume(self) -> None:
-        """End a stop, and command the present pose until the blend factor is 1."""
-        self.advance(0.6)
+        """End a stop, and command the present pose until the blend factor is 1.
+
+        After a robot was replaced, statuses are used when they have come from one source for `SOURCE_TIME`.
+        """
+        self.advance(SOURCE_TIME + 0.1)
         self.pose = self["pose"].copy()
         self.station.resume(self.context)
         self.advance(0.8)
@@ -105,6 +109,13 @@ def run_checks() -> list[str]:
         check("stop", run["arm_state"][0] == ArmState.OFF, run.describe())
         run.resume()
         check("resume", run["arm_state"][0] == ArmState.RUNNING, run.describe())
+        # Back to the start: a robot that replaces this one is only followed in the last posture.
+        run.advance((run.pose[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
+        run.advance((START[3] - run.pose[3]) / TURN, np.array([0.0, 0.0, 0.0, TURN, 0.0, 0.0]))
+        run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, DOWN, 0.0, 0.0, 0.0]))
+        run.advance(0.3)
+        height, turn = run["pose"][2] - START[2], run["pose"][3] - START[3]
+        check("unlock", abs(height) < 1e-3 and abs(turn) < np.deg2rad(8.0), run.describe())
         robot.kill()
         run.advance(0.6)
         check(

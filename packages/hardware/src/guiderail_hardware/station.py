@@ -54,6 +54,7 @@ from guiderail_hardware.models.round_trip import max_round_trip
 from guiderail_hardware.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail_hardware.systems.pose_publisher import PosePublisher
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
+from guiderail_hardware.systems.spring_reference import SpringReference
 from guiderail_hardware.systems.status_watchdog import StatusWatchdog
 from guiderail_hardware.systems.torque_publisher import TorquePublisher
 from guiderail_hardware.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
@@ -231,7 +232,13 @@ class HardwareStation(Station):
         if isinstance(self.driver, PoseDriver):
             X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
             poses = PosePublisher(guard.write_pose, guard.stop, X_BaseTarget, period=period)
-            add_system(builder, "publisher", poses, pose=limited_pose, arm_state=arm_state)
+            sent_pose = limited_pose
+            if self.driver.is_spring_and_damper:
+                reference = SpringReference(model, make_robot_impedance(model, self.impedance))
+                impedance_wrench = controller.get_impedance_wrench_output_port()
+                add_system(builder, "reference", reference, estimated_state=state, impedance_wrench=impedance_wrench)
+                sent_pose = reference.get_reference_pose_output_port()
+            add_system(builder, "publisher", poses, pose=sent_pose, arm_state=arm_state)
             # The torques of the robot's own controller are unknown: velocities are compared with positions only.
             no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
             builder.Connect(no_torque.get_output_port(), status.get_torque_input_port())

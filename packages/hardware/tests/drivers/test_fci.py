@@ -14,6 +14,7 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import approach_impedance
 from guiderail_hardware.drivers import fci
 from guiderail_hardware.drivers.driver import describe_stop
 from guiderail_hardware.drivers.fci import (
@@ -25,12 +26,13 @@ from guiderail_hardware.drivers.fci import (
 from guiderail_hardware.models.joint_status import Fault
 from guiderail_hardware.robot.preflight import PreflightChecks, check_robot, confirm_checks
 from guiderail_hardware.robot.sim_driver import START
-from guiderail_hardware.station import HardwareStation, make_robot_impedance
+from guiderail_hardware.station import HardwareStation, make_robot_impedance, tool_jacobian
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 from oracles.franka import FRANKA_LIMITS
 
 WORKCELL = BncWorkcell()
 IMPEDANCE = Impedance().with_max_force(18.0)
+READ_PERIOD = 0.0025  # the driver reads twice per period [s]
 
 
 class FrankyError(Exception):
@@ -49,21 +51,23 @@ class Affine:
 
 
 class Robot:
-    """Double of the client's robot: it rests at its joint positions and records calls of its methods."""
+    """Double of the client's robot: it moves with constant joint velocities and records calls of its methods."""
 
     def __init__(self, positions):
         self.calls, self.errors, self.is_connected, self.motion_error = [], NO_ERRORS, True, None
         self.positions, self.external, self.time = positions, np.zeros(7), 0.0
+        self.velocities = np.zeros(7)
         self.can_recover, self.mode, self.tool, self.mass = True, "RobotMode.Idle", np.eye(4), 0.0
 
     @property
     def state(self):
         if not self.is_connected:
             raise NetworkError
-        self.time += 0.0025  # the driver reads twice per period
+        self.time += READ_PERIOD
+        self.positions = self.positions + READ_PERIOD * self.velocities
         return SimpleNamespace(
             q=self.positions,
-            dq=np.zeros(7),
+            dq=self.velocities,
             tau_ext_hat_filtered=self.external,
             time=SimpleNamespace(to_sec=lambda time=self.time: time),
             current_errors=self.errors,
@@ -400,12 +404,35 @@ def test_station_sends_poses_that_begin_at_the_measured_pose(robot):
     (motion,) = motions(robot)
     expected = WORKCELL.X_WT @ RigidTransform([0.0, 0.0, START[2]])
     np.testing.assert_allclose(motion.references[0][:3, 3], expected.translation(), atol=1e-4)
-    loop.command(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    step = 0.9 * IMPEDANCE.limits[0] / IMPEDANCE.stiffness[0]  # within the bound of a robot that does not move
+    loop.command(START + [step, 0.0, 0.0, 0.0, 0.0, 0.0])
     loop.advance(0.5)
     positions = np.array([reference[:3, 3] for reference in motion.references])
-    np.testing.assert_allclose(positions[-1] - positions[0], [0.01, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(positions[-1] - positions[0], [step, 0.0, 0.0], atol=1e-6)
     speed = np.linalg.norm(np.diff(positions, axis=0), axis=1).max() / loop.station.period
     assert 0.0 < speed <= FciDriver.motion_limits.linear[0]
+
+
+@pytest.mark.parametrize(("share", "is_pushed"), [(0.5, True), (1.5, False)])
+def test_robot_is_not_pushed_above_the_approach_speed(robot, share, is_pushed):
+    """The force bounds the speed by F / c; see `docs/concepts/forces.md`."""
+    loop = Loop(robot)
+    loop.command(START - [0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
+    loop.advance(1.0)
+    model, bound = loop.station.controller_plant, IMPEDANCE.bound
+    J, context = tool_jacobian(model, robot.positions, model.target), model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, robot.positions)
+    direction = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+    mass = 1.0 / (direction @ J @ np.linalg.solve(model.plant.CalcMassMatrix(context), J.T @ direction))
+    speed = share * bound.force / approach_impedance(bound.contact_stiffness, mass)
+    robot.velocities = np.linalg.pinv(J) @ (speed * direction)
+    loop.advance(4 * loop.station.period)
+    assert loop.arm_state == ArmState.RUNNING
+    model.plant.SetPositions(context, robot.positions)
+    below = (model.tool_center.CalcPoseInWorld(context).translation() - motions(robot)[0].references[-1][:3, 3])[2]
+    gains = make_robot_impedance(model, IMPEDANCE)
+    force = gains.stiffness[2, 2] * below - gains.damping[2, 2] * speed
+    assert (force > 1.0) == is_pushed
 
 
 def test_force_limit_that_an_action_changes_is_refused(robot, monkeypatch):

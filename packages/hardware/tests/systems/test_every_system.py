@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
+from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail_hardware import systems
 from guiderail_hardware.models.joint_status import StatusLimits
+from guiderail_hardware.station import make_robot_impedance
 from oracles.franka import FRANKA_LIMITS
 from oracles.systems import RULES, check_source, system_names
 
@@ -24,6 +26,7 @@ PERIOD = 0.125
 def system_by_name():
     """Return one instance of each system by name, with all optional ports."""
     plant, _ = controller_model(BncWorkcell())
+    model = ArmControllerPlant(BncWorkcell(), "panda")
     safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
     gamepad = SimpleNamespace(index=None, axes=[])
     browser = SimpleNamespace(
@@ -35,6 +38,7 @@ def system_by_name():
         systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
+        systems.SpringReference(model, make_robot_impedance(model, Impedance())),
         systems.StatusWatchdog(plant, StatusLimits((1.0,) * 7), (1.0,) * 7, period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
         systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD, hold=lambda: None),

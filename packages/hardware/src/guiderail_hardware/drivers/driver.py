@@ -167,6 +167,9 @@ class PoseDriver(Driver):
     """
 
     motion_limits: ClassVar[MotionLimits]  # limits of the desired poses that the robot accepts
+    # True if the robot's wrench is K e − D V with the `RobotImpedance`. The station then sends the reference with which
+    # this wrench is the station's, so that the approach speed is limited; see `SpringReference`.
+    is_spring_and_damper: ClassVar[bool] = False
 
     @abstractmethod
     def configure(self, impedance: RobotImpedance) -> None:

@@ -30,9 +30,7 @@ POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/r
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
 # Collision thresholds of the robot, relative to the impedance's largest wrench along an axis. The force threshold is at
-# least the threshold in libfranka's examples [N], because the robot's estimate has an error of some newtons. In
-# simulation a plug that drops from a rim into its hole ends with an impact of 1.9 times the impedance's largest force
-# (28 N instead of 15 N; eight episodes).
+# least the threshold in libfranka's examples [N], because the robot's estimate has an error of some newtons.
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 2.5, 20.0
 MAX_TOOL_ERROR = 1e-4  # largest error of an entry of the tool frame's matrix that the robot reports [m, 1]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
@@ -55,6 +53,7 @@ class FciDriver(PoseDriver):
     hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause
     # A fifth of the robot's linear and four fifths of its angular velocity, and half of its accelerations and jerks. A
     # single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
+    is_spring_and_damper = True
     motion_limits = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 
     def __init__(self, url: str = "", *, client: Any = None):
@@ -203,7 +202,7 @@ class FciDriver(PoseDriver):
         franky = self._franky
         limits = impedance.max_wrench
         motion = franky.CartesianImpedanceTrackingMotion(
-            # A bounded error bounds the spring's wrench; the limited speed of the poses bounds the damper's wrench.
+            # A bounded error bounds the spring's wrench also if no new reference arrives (`SpringReference`).
             # With franky's own `force_constraints` (2.0.0) the simulated arm accelerated to 5 rad/s.
             translational_error_clip=limits[:3] / np.diag(impedance.stiffness)[:3],
             rotational_error_clip=limits[3:] / np.diag(impedance.stiffness)[3:],

@@ -150,6 +150,8 @@ class WorkcellSimulator(MujocoSimulator):
             if body.get("name", "").startswith((ROBOT + "hand", ROBOT + "left", ROBOT + "right")):
                 for geometry in body.findall("geom"):
                     geometry.attrib.update(contype="0", conaffinity="0")
+            if body.get("name", "").startswith((ROBOT + "left", ROBOT + "right")):
+                body.set("gravcomp", "1")  # the robot compensates the weight of the hand without its fingers, 0.3 N
         return self._arm
 
     def _start(self) -> None:

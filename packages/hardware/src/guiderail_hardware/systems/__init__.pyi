@@ -3,6 +3,7 @@ from .meshcat_device import MeshcatDevice as MeshcatDevice
 from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter
 from .pose_publisher import PosePublisher as PosePublisher
 from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
+from .spring_reference import SpringReference as SpringReference
 from .status_watchdog import StatusWatchdog as StatusWatchdog
 from .torque_publisher import TorquePublisher as TorquePublisher
 from .torque_safety_limiter import ArmState as ArmState
