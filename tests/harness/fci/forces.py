@@ -4,13 +4,13 @@
 
 A round has a force limit, a friction of the joints, a contact and a robot process. Its references lie anywhere in the
 box of `force_adversary.Anywhere` around a pose above the connector: random, held, at the corners, and bang-bang. The
-contact is MuJoCo's own, or softer. The robot records the force of its commanded torques and the
-contact's force in every step of the engine, a quarter of a millisecond. Contact forces are less what the joints'
+contact is MuJoCo's own, or softer. The robot records the force of its commanded torques and the contact's force in
+every step of the engine, a quarter of a millisecond. Contact forces are less what the joints'
 friction holds, relative to the limit. A stop is counted, and its forces in the control step in which it begins; then
 the motion is resumed, or the round ends.
 
-The output is a table (CSV) with a row for each round. The exit code is 1 if a force exceeded its bound, see
-docs/concepts/forces.md.
+The output is a table (CSV) with a row for each round. The exit code is 1 if a contact force exceeded its bound, see
+docs/concepts/forces.md. The impedance's force has no bound here: between two references, the robot moves.
 """
 
 from __future__ import annotations

@@ -51,9 +51,9 @@ class FciDriver(PoseDriver):
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
     hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause
+    is_spring_and_damper = True
     # A fifth of the robot's linear and four fifths of its angular velocity, and half of its accelerations and jerks. A
     # single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
-    is_spring_and_damper = True
     motion_limits = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 
     def __init__(self, url: str = "", *, client: Any = None):

@@ -417,17 +417,14 @@ class StateEstimator:
             return False
         values = status.values()
         change = values - accepted.values
-        deviation = self._deviation(values, change, elapsed, change[self._velocities])
+        deviation = _beyond(self._difference(values, change, elapsed), LAG * elapsed * np.abs(change[self._velocities]))
         is_moving_as_predicted = np.abs(values[self._velocities] - state.velocity) <= AGREEMENT
         return bool((is_moving_as_predicted & (np.abs(deviation) <= self._limits.position_tolerance)).all())
 
-    def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float, late: np.ndarray) -> np.ndarray:
-        """Return the part of each position's change that the velocities do not explain, (n,) [rad].
-
-        `late` (n,) is the part of their change that may be reported late [rad/s].
-        """
-        error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * change[self._velocities])
-        return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(late), 0.0)
+    def _difference(self, values: np.ndarray, change: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return the difference between each position's change and the integrated velocity, (n,) [rad]."""
+        mean = values[self._velocities] - 0.5 * change[self._velocities]
+        return np.asarray(change[self._positions] - elapsed * mean)
 
     def _update_positions(
         self, state: EstimatorState, values: np.ndarray, change: np.ndarray, elapsed: float
@@ -440,8 +437,9 @@ class StateEstimator:
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
         acceleration, largest = change[self._velocities], MAX_ACCELERATION * self._period
         smooth = np.clip(acceleration, -largest, largest)
-        residual = self._deviation(values, change, elapsed, acceleration)
-        drift = self._deviation(values, change, elapsed, acceleration - smooth)
+        difference, lag = self._difference(values, change, elapsed), LAG * elapsed
+        residual = _beyond(difference, lag * np.abs(acceleration))
+        drift = _beyond(difference, lag * np.abs(acceleration - smooth))
         return state._replace(
             residual=np.exp(-elapsed / POSITION_WINDOW) * state.residual + residual,
             drift=np.exp(-elapsed / DRIFT_WINDOW) * state.drift + drift,
@@ -564,3 +562,8 @@ class StateEstimator:
         elif check_time - state.doubt_time > self._limits.settling_time:
             state = state._replace(doubt_time=np.nan)
         return Estimate(fault or Fault(int(before.fault)), age, is_new, state)
+
+
+def _beyond(values: np.ndarray, slack: np.ndarray) -> np.ndarray:
+    """Return the part of values (n,) that is larger than `slack` (n,), with its sign."""
+    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - slack, 0.0))
