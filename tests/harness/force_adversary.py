@@ -12,14 +12,16 @@ conditions of the episode with the largest transient force.
 
 The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md). Contact forces
 are less what the joints' friction holds, relative to the limit of the episode plus the weight of the payload. The table
-is printed, and written to `--out`. A run continues from that file; only the search starts again then. The exit code is
-1 if an episode ended by force, or if a force exceeded its bound.
+is printed, and written to `--out`, and the episode of each largest transient force to a file of the case beside it,
+which `--replay` repeats. A run continues from that table; only the search starts again then. The exit code is 1 if an
+episode ended by force, or if a force exceeded its bound.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import math
 import sys
 from collections.abc import Callable
@@ -191,21 +193,96 @@ class Search:
         return lambda: next(sequence, self.actions[-1])
 
 
-def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool) -> None:
-    """Run attacks for at least `steps` control steps and add them to a case; `searches` are by the guidance."""
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of a round: factors of the friction and the moving mass, joint friction [Nm], and payload [kg]."""
+
+    task: str
+    station: str
+    stiffness: int  # of the contact [N/mm]
+    guidance: str
+    is_limit_sampled: bool
+    is_bounded: bool
+    friction: float
+    mass: float
+    joint_friction: float
+    payload: float
+
+    @classmethod
+    def sample(cls, case: Case, rng: np.random.Generator, is_bounded: bool) -> Conditions:
+        """Return random conditions of a round of a case."""
+        arm, gantry = case.station == "arm", case.station == "gantry"
+        return cls(
+            case.task,
+            case.station,
+            case.stiffness,
+            guidance=ANYWHERE if case.rounds % 3 else str(rng.choice(GUIDANCE[case.task])),
+            is_limit_sampled=bool(rng.random() < 0.5),
+            is_bounded=is_bounded,
+            payload=float(rng.choice(PAYLOADS)) if arm else 0.0,
+            mass=float(rng.choice(MASS_FACTORS)) if gantry else 1.0,
+            friction=float(rng.choice(FRICTION_FACTORS)),
+            joint_friction=float(rng.choice(JOINT_FRICTIONS)) if arm else 0.0,
+        )
+
+    def make_env(self) -> Any:
+        """Return the environment."""
+        options: dict[str, Any] = {"force_limit_range": LIMITS} if self.is_limit_sampled else {}
+        return make_env(
+            self.task,
+            guidance=self.guidance,
+            station=self.station,
+            difficulty="hard",
+            action_repeat=5,
+            bounded_force=self.is_bounded,
+            disturbances={"payload": self.payload, "joint_friction": self.joint_friction},
+            **options,
+        )
+
+    def run(self, env: Any, seed: int, act: Callable[[], np.ndarray]) -> Outcome:
+        """Run an episode with a seed of the environment."""
+        *_, info = env.reset(seed=seed, options={"new_run": True})
+        context = env.simulator.get_mutable_context()
+        station_of(env).set_contact(context, self.friction, CONTACTS[self.station][self.task][self.stiffness])
+        if self.mass != 1.0:
+            scale_mass(env, self.mass)
+        limit = info.get("force_limit", env.diagram.task.collision.above)
+        held, forces, actions = held_force(env, self.joint_friction), watch_contact(env), []
+        terminated = truncated = False
+        while not (terminated or truncated):
+            actions.append(act())
+            *_, terminated, truncated, info = env.step(actions[-1])
+        return Outcome(info, limit, limit + GRAVITY * self.payload, held, np.array(forces), np.array(actions))
+
+
+@dataclass
+class Outcome:
+    """An episode: its last `info`, limit, limit with weight and force that friction holds [N], contact forces [N]."""
+
+    info: dict[str, Any]
+    limit: float
+    scale: float
+    held: float
+    forces: np.ndarray  # (plant steps,)
+    actions: np.ndarray
+
+    @property
+    def transient(self) -> float:
+        """Largest contact force, relative to the limit."""
+        return float(self.forces.max() - self.held) / self.scale
+
+
+def run_round(
+    case: Case, searches: dict[str, Search], steps: int, is_bounded: bool, report: Callable[[str, str], None]
+) -> None:
+    """Run attacks for at least `steps` control steps and add them to a case; `searches` are by the guidance.
+
+    Every new largest transient force is passed to `report` as name and JSON of its episode; see `replay`.
+    """
     rng = np.random.default_rng([SEED, STATIONS.index(case.station), case.stiffness, case.rounds])
-    guidance = ANYWHERE if case.rounds % 3 else str(rng.choice(GUIDANCE[case.task]))
-    options: dict[str, Any] = {"guidance": guidance, "station": case.station, "difficulty": "hard"}
-    if rng.random() < 0.5:
-        options["force_limit_range"] = LIMITS
-    payload = float(rng.choice(PAYLOADS)) if case.station == "arm" else 0.0
-    factor = float(rng.choice(MASS_FACTORS)) if case.station == "gantry" else 1.0
-    friction = float(rng.choice(FRICTION_FACTORS))
-    joint_friction = float(rng.choice(JOINT_FRICTIONS)) if case.station == "arm" else 0.0
-    options["disturbances"] = {"payload": payload, "joint_friction": joint_friction}
-    env = make_env(case.task, action_repeat=5, bounded_force=bounded, **options)
-    size, best, done = env.action_space.shape[0], searches.setdefault(guidance, Search()), 0
-    station, modulus = station_of(env), CONTACTS[case.station][case.task][case.stiffness]
+    conditions = Conditions.sample(case, rng, is_bounded)
+    env = conditions.make_env()
+    size, best, done = env.action_space.shape[0], searches.setdefault(conditions.guidance, Search()), 0
     while done < steps:
         seed, candidate = SEED + case.episodes, None
         if case.episodes % 2:
@@ -213,31 +290,43 @@ def run_round(case: Case, searches: dict[str, Search], steps: int, bounded: bool
             seed, act = candidate.seed, candidate.act()
         else:
             act = attack(ATTACKS[case.episodes // 2 % len(ATTACKS)], rng, size)
-        *_, info = env.reset(seed=seed, options={"new_run": True})
-        station.set_contact(env.simulator.get_mutable_context(), friction, modulus)
-        if factor != 1.0:
-            scale_mass(env, factor)
-        limit = info.get("force_limit", env.diagram.task.collision.above)
-        scale, held = limit + GRAVITY * payload, held_force(env, joint_friction)
-        forces, terminated, truncated = watch_contact(env), False, False
-        while not (terminated or truncated):
-            *_, terminated, truncated, info = env.step(act())
-        transient = (max(forces) - held) / scale
+        outcome = conditions.run(env, seed, act)
+        transient, limit, control_steps = outcome.transient, outcome.limit, outcome.info["control_steps"]
         if candidate is not None and transient > best.force:
             candidate.force = transient
-            searches[guidance] = best = candidate
+            searches[conditions.guidance] = best = candidate
+        if round(transient, 3) > case.transient:
+            episode = asdict(conditions) | {"seed": seed, "transient": transient, "actions": outcome.actions.tolist()}
+            report(f"{case.task}-{case.station}-{case.stiffness}", json.dumps(episode))
+        held, scale = outcome.held, outcome.scale
         wrench, statistics = env.trace.signals["wrench"][:, :3], env.trace.statistics()
-        case.episodes, case.control_steps = case.episodes + 1, case.control_steps + info["control_steps"]
-        case.plant_steps += round(info["control_steps"] * env.diagram.control_period / station.time_step)
-        case.stops += info["termination"] == "collision"
+        case.episodes, case.control_steps = case.episodes + 1, case.control_steps + control_steps
+        case.plant_steps += round(control_steps * env.diagram.control_period / station_of(env).time_step)
+        case.stops += outcome.info["termination"] == "collision"
         case.impedance = max(case.impedance, round(float(env.trace.force.max()) / limit, 3))
         case.filtered = max(case.filtered, round(float(np.linalg.norm(wrench, axis=1).max() - held) / scale, 3))
         case.quasi_static = max(case.quasi_static, round((statistics["quasi_static_force"] - held) / scale, 3))
         case.transient = max(case.transient, round(transient, 3))
         case.tank_J = min(case.tank_J, round(tank_content(env), 2))
-        done += info["control_steps"]
+        done += control_steps
     case.rounds += 1
     env.close()
+
+
+def replay(path: Path) -> float:
+    """Repeat a stored episode, print its force, and return its largest transient force, relative to the limit."""
+    episode = json.loads(path.read_text())
+    seed, transient, actions = (episode.pop(name) for name in ("seed", "transient", "actions"))
+    conditions, sequence = Conditions(**episode), iter(np.array(actions))
+    env = conditions.make_env()
+    outcome = conditions.run(env, seed, lambda: next(sequence))
+    step = env.diagram.control_period * outcome.info["control_steps"] / (len(outcome.forces) - 1)
+    time = outcome.forces.argmax() * step
+    print(f"transient force {outcome.transient:.3f} F after {time:.4f} s, F = {outcome.limit:.2f} N")
+    env.close()
+    if abs(outcome.transient - transient) > 1e-9:
+        print(f"the stored one is {transient:.3f} F")
+    return outcome.transient
 
 
 def station_of(env: Any) -> Any:
@@ -377,9 +466,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
     parser.add_argument("--out", type=Path, help="CSV file of the table, from which a run continues")
+    parser.add_argument("--replay", type=Path, help="file of an episode, which is repeated instead")
     parser.add_argument("--measure", action="store_true", help="print the stiffness of each contact instead")
     args = parser.parse_args(arguments)
     register_guidance(ANYWHERE)(Anywhere)
+    if args.replay is not None:
+        replay(args.replay)
+        return 0
     cases = {(case.task, case.station, case.stiffness): case for case in read(args.out)}
     for station in STATIONS:
         for task, contacts in CONTACTS[station].items():
@@ -394,11 +487,16 @@ def main(arguments: list[str] | None = None) -> int:
                 stiffness = measured_stiffness(case.task, case.station, modulus)
                 print(f"{case.task}, {case.station}, factor {modulus:g} of the modulus: {stiffness:.0f} N/mm")
         return 0
+
+    def report(name: str, episode: str) -> None:
+        if args.out is not None:
+            args.out.with_name(f"{args.out.stem}-{name}.json").write_text(episode)
+
     searches: dict[int, dict[str, Search]] = {number: {} for number in range(len(table))}
     steps = min(ROUND, max(args.steps // len(table), 1))
     while (remaining := args.steps - sum(case.control_steps for case in table)) > 0:
         number = min(range(len(table)), key=lambda index: table[index].control_steps)
-        run_round(table[number], searches[number], min(steps, remaining), args.bounded == "true")
+        run_round(table[number], searches[number], min(steps, remaining), args.bounded == "true", report)
         if args.out is not None:
             write(table, args.out)
     for case in table:
