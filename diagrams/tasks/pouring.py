@@ -103,8 +103,11 @@ HARD: Mapping[str, Any] = {
 Without the shield 26 % of the training episodes spill, and the policies pour in 87 to 99 % of the held-out episodes.
 """
 
-THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0, "pour_distance": 0.1, "funnel": False}
+THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0, "pour_distance": 0.09, "funnel": False}
 """Options of difficulty="thesis": the pace of the thesis, and a template that does not lead to where pouring succeeds.
+
+With SAC, ten successes in a row begin after 5 episodes if the template pours from 75 or 87.5 mm, after 76 from 90 mm,
+and not within 150 from 92.5, 95 or 100 mm (one run each). The thesis has 65 on its robot and 250 in simulation.
 
 The 65 episodes of the thesis had 149 actions each on average.
 At the standard speed, the scripted policy pours within 28 actions; at this speed within about 90. Uncorrelated random
@@ -204,10 +207,6 @@ OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip: distance from the mug's ax
 POURING_DISTANCE = 0.078  # [m] distance from the mug's opening below which the inputs are only horizontal
 SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to this distance
 
-ABOVE_THE_RIM = (0.050, 0.12)  # [m] goal of the tip before it is lowered: distance from the mug's axis, height
-ABOVE_TOLERANCE = 0.004  # [m] distance from this goal's radius within which the tip is lowered
-HIGHEST_POUR = 0.0755  # [m] height of the tip below which the state Pour can begin
-DESCENT = -0.6  # vertical input that lowers the tip
 
 # [m] goal of the tip until the state Pour begins: distance from the axis of the estimated mug, height above its rim
 AIM_OVER_THE_RIM = (0.03, 0.045)
@@ -225,23 +224,6 @@ def scripted_pour(observation: np.ndarray) -> np.ndarray:
         return np.array([*to_axis, 0.0])
     distance, height = OVER_THE_RIM
     return np.clip((np.array([*(-distance * to_axis), height]) - p_MP) / SOFTNESS, -1.0, 1.0)
-
-
-def scripted_pour_from_above(observation: np.ndarray) -> np.ndarray:
-    """Return inputs (3,) that move the tip over the mug, lower it until the state Pour begins, and then tilt.
-
-    With difficulty="thesis", the state Pour begins so early that both balls only fall into the mug from above.
-    """
-    p_MP = observation[:3] / POSITION_SCALE
-    horizontal = float(np.hypot(p_MP[0], p_MP[1]))
-    to_axis = -p_MP[:2] / max(horizontal, 1e-9)
-    distance, height = ABOVE_THE_RIM
-    if np.linalg.norm(p_MP) < THESIS["pour_distance"] and p_MP[2] < HIGHEST_POUR:
-        return np.array([*to_axis, 0.0])
-    if horizontal > distance + ABOVE_TOLERANCE:
-        along = (horizontal - distance) / SOFTNESS
-        return np.clip([*(min(along, 1.0) * to_axis), (height - p_MP[2]) / SOFTNESS], -1.0, 1.0)
-    return np.array([0.0, 0.0, DESCENT])
 
 
 def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
@@ -287,8 +269,8 @@ class Pouring(Task):
     has_held_out_distribution = True
     defaults = {"guidance": "sct", "action_repeat": 10}
     presets = {"hard": HARD, "thesis": THESIS}
-    scripted_policies = (scripted_pour, scripted_pour_from_above, scripted_pour_aimed, scripted_pour_blind)
-    scripted_defaults = {"hard": scripted_pour_aimed, "thesis": scripted_pour_from_above}
+    scripted_policies = (scripted_pour, scripted_pour_aimed, scripted_pour_blind)
+    scripted_defaults = {"hard": scripted_pour_aimed}
     learner = {"algorithm": "sac", "preset": "pouring"}
     clip = 10.0
 

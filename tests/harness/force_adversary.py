@@ -3,12 +3,13 @@
     python tests/harness/force_adversary.py --steps 100000 --out forces.csv  # ten minutes of one core
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
 
-A case is a task at difficulty=hard, on a station, with a contact of a given stiffness. Each round of a case draws a
-guidance, a factor of the friction and a range of force limits, on an arm also a payload and a friction of the joints
-that its controller does not model, and on the gantry a factor of the moving mass. In two of three rounds the guidance
-is `Anywhere`, which commands what a policy behind guidance cannot: any reference in a box around the target, to fall on
-the rim, or off it and into the walls. Half of the episodes belong to an evolution strategy, which changes actions or
-conditions of the episode with the largest transient force.
+A case is a task at difficulty=hard, on a station, with a contact of a given stiffness and a time step: the default, or
+one that resolves impacts on soft contacts. Each round of a case draws a guidance, factors of friction and dissipation
+and a range of force limits, on an arm also a payload and a friction of the joints that its controller does not model,
+and on the gantry a factor of the moving mass. In two of three rounds the guidance is `Anywhere`, which commands what a
+policy behind guidance cannot: any reference in a box around the target, to fall on the rim, or off it and into the
+walls. Half of the episodes belong to an evolution strategy, which changes actions or conditions of the episode with the
+largest transient force.
 
 The table has a row for each case, with the largest forces and their bounds (docs/concepts/forces.md). Contact forces
 are less what the joints' friction holds, relative to the limit of the episode plus the weight of the payload. The table
@@ -21,41 +22,49 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import json
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake.geometry import ProximityProperties, Role, RoleAssign
+from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from pydrake.systems.framework import Context, EventStatus
+from scipy.integrate import solve_ivp
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
-from guiderail.models.control.wrench import FORCE_SHARES, impact_ratio
+from guiderail.models.control.wrench import FORCE_SHARES, approach_impedance, impact_ratio
 from guiderail.models.laws.law import Command, Law
 from guiderail_mujoco.station import MujocoContact
 
 ANYWHERE = "anywhere"  # registered name of `Anywhere`
 GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
 STATIONS = ("gantry", "arm", "mujoco")
-# Stiffness of the contact with the rim [N/mm] that `--measure` prints, and the factor of the contact's modulus for it.
+# Largest stiffness of the contact with the rim [N/mm] that `--measure` prints, and the factor of the contact's modulus.
 DRAKE = {
-    "BncConnector": {982: 1.0, 199: 5.8e-4, 105: 2.8e-4, 24: 6e-5},
-    "GridClamp": {9160: 1.0, 206: 0.022, 105: 0.011, 25: 2.4e-3},
+    "BncConnector": {15400: 1.0, 210: 5.8e-4, 105: 2.8e-4, 23: 6e-5},
+    "GridClamp": {7800: 1.0, 233: 0.022, 132: 0.011, 29: 2.4e-3},
 }
 CONTACTS = {
     "gantry": DRAKE,
     "arm": DRAKE,
     "mujoco": {
-        "BncConnector": {1170: 1.0, 166: 7.4e-4, 80: 3.3e-4},
+        "BncConnector": {1180: 1.0, 171: 7.4e-4, 82: 3.3e-4},
         "GridClamp": {311000: 1.0, 188: 6e-4, 100: 3.2e-4},
     },
 }
+# Default time steps of the plant, and one that resolves impacts on soft contacts [ms].
+STEPS = {"BncConnector": (5.0, 1.0), "GridClamp": (10.0, 1.0)}
+ENGINE_STEPS = (1.0,)  # of MuJoCo
+FINE_SHARE = 5  # a case with a finer step gets one in this number of control steps, because they take longer
 RIM = {"BncConnector": 0.004, "GridClamp": 0.005}  # distance from the target at which the workpiece is on the rim [m]
 FRICTION_FACTORS = (0.5, 1.0, 2.0)
 REACH = np.array([0.008, 0.008, 0.025, 0.3, 0.1, 0.1])  # of `Anywhere` from the start [m], [rad]
@@ -64,11 +73,12 @@ LIMITS = (8.0, 25.0)  # range of sampled force limits [N]
 PAYLOADS = (0.0, 0.25, 0.5)  # a weight of up to 5 N, the largest that is not refused before a motion [kg]
 JOINT_FRICTIONS = (0.0, 0.3, 0.7)  # of each joint of the arm [Nm]
 MASS_FACTORS = (0.8, 1.0, 1.2)
+DISSIPATION_FACTORS = (0.0, 1.0)
 GRAVITY = 9.81  # [m/s²]
 MASS = {"gantry": 1.5, "arm": 1.4, "mujoco": 1.5}  # smallest moving mass in any direction [kg]
 # Of the mass at the farthest contact on a gantry, 1 / (1 + l² m / I) for l = 14 and 44 mm; on an arm, I is not known.
 MASS_SHARE = {"BncConnector": 0.87, "GridClamp": 0.39}
-DELAY = {"gantry": 0.0, "arm": 0.005, "mujoco": 0.0}  # period of a controller that is not solved with the contact [s]
+DISSIPATION = {"BncConnector": 100.0, "GridClamp": 1.0}  # largest one of a contact in Drake [s/m]
 SEED = 2_100_000
 ROUND = 2000  # control steps of a round
 
@@ -83,6 +93,7 @@ class Case:
     task: str
     station: str
     stiffness: int  # of the contact [N/mm]
+    step_ms: float  # time step of the plant, or of MuJoCo
     rounds: int = 0
     episodes: int = 0
     control_steps: int = 0
@@ -99,10 +110,15 @@ class Case:
     def __post_init__(self) -> None:
         self.quasi_static_bound = round(math.hypot(*FORCE_SHARES), 3)
         share = 1.0 if self.station == "arm" else MASS_SHARE[self.task]
-        if self.station == "mujoco" and CONTACTS["mujoco"][self.task][self.stiffness] == 1.0:
-            bound = mujoco_bound(share)
+        if self.station == "mujoco":
+            bound = mujoco_bound(share, modulus=CONTACTS["mujoco"][self.task][self.stiffness])
         else:
-            bound = transient_bound(1e3 * self.stiffness, MASS[self.station], DELAY[self.station], share)
+            mass, heavier = MASS[self.station], 1.0 if self.station == "arm" else max(MASS_FACTORS)
+            speed = max(LIMITS) / approach_impedance(CONTACT_STIFFNESS, mass)
+            # The controller of an arm has the period of the plant; on the gantry it is solved with the contact.
+            delay = 1e-3 * self.step_ms if self.station == "arm" else 0.0
+            stiffness = 1e3 * self.stiffness
+            bound = transient_bound(stiffness, mass, delay, share, heavier, DISSIPATION[self.task] * speed)
         self.transient_bound = round(bound, 2)
 
     @property
@@ -115,30 +131,66 @@ class Case:
         )
 
 
-def transient_bound(stiffness: float, mass: float, delay: float, share: float) -> float:
+def transient_bound(
+    stiffness: float, mass: float, delay: float, share: float, heavier: float = 1.0, damping: float = 0.0
+) -> float:
     """Return the bound of a transient contact's force, relative to the limit.
 
     Args:
         stiffness: Stiffness of the contact [N/m].
-        mass: Moving mass [kg].
+        mass: Moving mass [kg] that the controller assumes.
         delay: Period of the controller, 0 if spring and damper are solved with the contact [s].
         share: Share of the mass at the farthest contact; see `impact_ratio`.
+        heavier: Actual mass relative to the assumed one.
+        damping: Dissipation of the contact times the largest approach speed; 0 for `impact_ratio`.
     """
-    return impact_ratio(stiffness / CONTACT_STIFFNESS, share) + delay * math.sqrt(stiffness / mass)
+    ratio = stiffness / CONTACT_STIFFNESS
+    pressed = peak(ratio, heavier, 1.0, damping)
+    turned = peak(ratio, heavier * share, 1.5 * share, damping)
+    return max(pressed, turned) + delay * math.sqrt(stiffness / mass)
 
 
-def mujoco_bound(share: float, mass: float = 1.65, contact: MujocoContact = MujocoContact()) -> float:  # noqa: B008
-    """Return the bound of a transient force in MuJoCo's own contact, relative to the limit F; `mass` is the largest.
+def peak(ratio: float, mass: float, drive: float, damping: float) -> float:
+    """Return the largest force of an impact on a spring with Hunt–Crossley damping, relative to the limit F.
+
+    The force is r / 4 x (1 + δ x') for m x'' = f (1 − x') − r / 4 x (1 + δ x') with x'(0) = 1, in units in which F, c
+    and the assumed mass are 1: r is the `ratio` of the stiffnesses, f the `drive`, and δ the `damping`.
+    """
+
+    def push(x: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        return 0.25 * ratio * x * (1.0 + damping * speed)
+
+    def rate(_: float, state: np.ndarray) -> np.ndarray:
+        x, speed = state
+        return np.array([speed, (drive * (1.0 - speed) - push(x, speed)) / mass])
+
+    def turns(_: float, state: np.ndarray) -> float:
+        return float(state[1])
+
+    turns.terminal = True  # type: ignore[attr-defined]
+    longest = 0.1 * math.sqrt(mass / (1.0 + ratio))
+    result = solve_ivp(rate, (0.0, 100.0), [0.0, 1.0], events=turns, max_step=longest, rtol=1e-8, atol=1e-10)
+    return float(push(*result.y).max())
+
+
+def mujoco_bound(
+    share: float,
+    mass: float = 1.65,
+    contact: MujocoContact = MujocoContact(),  # noqa: B008
+    modulus: float = 1.0,
+) -> float:
+    """Return the bound of a transient force in MuJoCo's contact, relative to the limit F; `mass` is the largest.
 
     This contact is a spring and a damper that act on the acceleration: damping b = 2 / (d τ) and stiffness 1 / (d τ²)
     of a unit mass. At the approach speed F / (2 √(k m)) its damper decides. A step h before, the depth is at most the
-    speed times h.
+    speed times h. A factor of the modulus divides τ by its root.
     """
+    contact = replace(contact, time_constant=contact.time_constant / math.sqrt(modulus))
     return impact_ratio(1.0, share) + mujoco_damping(contact) * 0.5 * math.sqrt(mass / CONTACT_STIFFNESS)
 
 
 def mujoco_damping(contact: MujocoContact) -> float:
-    """Return the force of an impact in MuJoCo's own contact per mass and speed [1/s]; see `mujoco_bound`."""
+    """Return the force of an impact in MuJoCo's contact per mass and speed [1/s]; see `mujoco_bound`."""
     d, constant = contact.impedance, contact.time_constant
     return 2.0 / (d * constant) + contact.time_step / (d * constant**2)
 
@@ -195,11 +247,12 @@ class Search:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of a round: factors of the friction and the moving mass, joint friction [Nm], and payload [kg]."""
+    """Conditions of a round: factors of friction, mass and dissipation, joint friction [Nm], and payload [kg]."""
 
     task: str
     station: str
     stiffness: int  # of the contact [N/mm]
+    step_ms: float
     guidance: str
     is_limit_sampled: bool
     is_bounded: bool
@@ -207,6 +260,7 @@ class Conditions:
     mass: float
     joint_friction: float
     payload: float
+    dissipation: float
 
     @classmethod
     def sample(cls, case: Case, rng: np.random.Generator, is_bounded: bool) -> Conditions:
@@ -216,6 +270,7 @@ class Conditions:
             case.task,
             case.station,
             case.stiffness,
+            case.step_ms,
             guidance=ANYWHERE if case.rounds % 3 else str(rng.choice(GUIDANCE[case.task])),
             is_limit_sampled=bool(rng.random() < 0.5),
             is_bounded=is_bounded,
@@ -223,11 +278,14 @@ class Conditions:
             mass=float(rng.choice(MASS_FACTORS)) if gantry else 1.0,
             friction=float(rng.choice(FRICTION_FACTORS)),
             joint_friction=float(rng.choice(JOINT_FRICTIONS)) if arm else 0.0,
+            dissipation=1.0 if case.station == "mujoco" else float(rng.choice(DISSIPATION_FACTORS)),
         )
 
     def make_env(self) -> Any:
         """Return the environment."""
         options: dict[str, Any] = {"force_limit_range": LIMITS} if self.is_limit_sampled else {}
+        if self.station != "mujoco":
+            options["time_step"] = 1e-3 * self.step_ms
         return make_env(
             self.task,
             guidance=self.guidance,
@@ -246,6 +304,8 @@ class Conditions:
         station_of(env).set_contact(context, self.friction, CONTACTS[self.station][self.task][self.stiffness])
         if self.mass != 1.0:
             scale_mass(env, self.mass)
+        if self.dissipation != 1.0:
+            scale_dissipation(env, self.dissipation)
         limit = info.get("force_limit", env.diagram.task.collision.above)
         held, forces, actions = held_force(env, self.joint_friction), watch_contact(env), []
         terminated = truncated = False
@@ -279,7 +339,7 @@ def run_round(
 
     Every new largest transient force is passed to `report` as name and JSON of its episode; see `replay`.
     """
-    rng = np.random.default_rng([SEED, STATIONS.index(case.station), case.stiffness, case.rounds])
+    rng = np.random.default_rng([SEED, STATIONS.index(case.station), case.stiffness, round(case.step_ms), case.rounds])
     conditions = Conditions.sample(case, rng, is_bounded)
     env = conditions.make_env()
     size, best, done = env.action_space.shape[0], searches.setdefault(conditions.guidance, Search()), 0
@@ -297,7 +357,7 @@ def run_round(
             searches[conditions.guidance] = best = candidate
         if round(transient, 3) > case.transient:
             episode = asdict(conditions) | {"seed": seed, "transient": transient, "actions": outcome.actions.tolist()}
-            report(f"{case.task}-{case.station}-{case.stiffness}", json.dumps(episode))
+            report(f"{case.task}-{case.station}-{case.stiffness}-{case.step_ms:g}", json.dumps(episode))
         held, scale = outcome.held, outcome.scale
         wrench, statistics = env.trace.signals["wrench"][:, :3], env.trace.statistics()
         case.episodes, case.control_steps = case.episodes + 1, case.control_steps + control_steps
@@ -372,10 +432,55 @@ def scale_mass(env: Any, factor: float) -> None:
         body.SetMass(context, factor * body.default_mass())
 
 
-def measured_stiffness(task: str, station: str, modulus: float) -> float:
-    """Return the stiffness of the contact with the rim [N/mm] between pressures of about 4.5 N and the largest one."""
+def scale_dissipation(env: Any, factor: float) -> None:
+    """Multiply the dissipation of all contacts by a factor, until the next reset."""
+    station = station_of(env)
+    graph, source = station.scene_graph, station.plant.get_source_id()
+    context = graph.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
+    inspector = graph.get_query_output_port().Eval(graph.GetMyContextFromRoot(env.simulator.get_context())).inspector()
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+        if properties.HasProperty("material", "hunt_crossley_dissipation"):
+            nominal = properties.GetProperty("material", "hunt_crossley_dissipation")
+            properties.UpdateProperty("material", "hunt_crossley_dissipation", factor * nominal)
+            graph.AssignRole(context, source, geometry, properties, RoleAssign.kReplace)
+
+
+def largest_stiffness(task: str, modulus: float) -> float:
+    """Return the largest stiffness of Drake's contact with the rim [N/mm] for forces up to three times the limit."""
+    env = make_env(task, guidance=ANYWHERE, difficulty="hard", action_repeat=5, time_step=2e-4)
+    env.reset(seed=SEED, options={"new_run": True})
+    station, root = station_of(env), env.simulator.get_mutable_context()
+    station.set_contact(root, 1.0, modulus)
+    context = station.plant.GetMyMutableContextFromRoot(root)
+    start = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(root)) + [
+        RIM[task],
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    ]
+
+    def force(depth: float) -> float:
+        station.set_pose(root, start - [0.0, 0.0, depth, 0.0, 0.0, 0.0])
+        station.plant.SetVelocities(context, np.zeros(station.plant.num_velocities()))
+        return float(np.linalg.norm(contact_force(station.plant.get_contact_results_output_port().Eval(context))))
+
+    free, touching = 0.0, next(depth for depth in np.arange(0.0, REACH[2], 2e-4) if force(depth) > 0.0)
+    while touching - free > 1e-9:
+        middle = 0.5 * (free + touching)
+        free, touching = (middle, touching) if force(middle) == 0.0 else (free, middle)
+    depths = np.geomspace(1e-7, 2e-3, 80)
+    forces = np.array([force(free + depth) for depth in depths])
+    env.close()
+    return float((np.diff(forces) / np.diff(depths))[forces[1:] < 3 * max(LIMITS)].max()) * 1e-3
+
+
+def pressed_stiffness(task: str, modulus: float) -> float:
+    """Return the stiffness of MuJoCo's contact with the rim [N/mm] between pressures of 4.5 N and the largest one."""
     difficulty = "hard_6s" if task == "GridClamp" else "hard"
-    env = make_env(task, guidance=ANYWHERE, station=station, difficulty=difficulty, action_repeat=5)
+    env = make_env(task, guidance=ANYWHERE, station="mujoco", difficulty=difficulty, action_repeat=5)
     env.reset(seed=SEED, options={"new_run": True})
     station_of(env).set_contact(env.simulator.get_mutable_context(), 1.0, modulus)
 
@@ -418,16 +523,20 @@ def watch_contact(env: Any) -> list[float]:
     contact = plant.get_contact_results_output_port()
 
     def add(root: Context) -> EventStatus:
-        results = contact.Eval(plant.GetMyContextFromRoot(root))
-        surfaces = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
-        points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
-        pushes = [surface.F_Ac_W().translational() for surface in surfaces]
-        pushes += [-point.contact_force() for point in points]
-        forces.append(float(np.linalg.norm(np.sum(pushes, axis=0))))
+        forces.append(float(np.linalg.norm(contact_force(contact.Eval(plant.GetMyContextFromRoot(root))))))
         return EventStatus.DidNothing()
 
     env.simulator.set_monitor(add)
     return forces
+
+
+def contact_force(results: ContactResults) -> np.ndarray:
+    """Return the sum of the contact forces of a plant (3,) [N]."""
+    surfaces = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
+    points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
+    pushes = [surface.F_Ac_W().translational() for surface in surfaces]
+    pushes += [-point.contact_force() for point in points]
+    return np.sum(pushes, axis=0) if pushes else np.zeros(3)
 
 
 def tank_content(env: Any) -> float:
@@ -473,29 +582,31 @@ def main(arguments: list[str] | None = None) -> int:
     if args.replay is not None:
         replay(args.replay)
         return 0
-    cases = {(case.task, case.station, case.stiffness): case for case in read(args.out)}
+    if args.measure:
+        for task, contacts in DRAKE.items():
+            for modulus in contacts.values():
+                print(f"{task}, Drake, factor {modulus:g} of the modulus: {largest_stiffness(task, modulus):.0f} N/mm")
+        for task, contacts in CONTACTS["mujoco"].items():
+            for modulus in contacts.values():
+                print(f"{task}, MuJoCo, factor {modulus:g} of the modulus: {pressed_stiffness(task, modulus):.0f} N/mm")
+        return 0
+    cases = {(case.task, case.station, case.stiffness, case.step_ms): case for case in read(args.out)}
     for station in STATIONS:
         for task, contacts in CONTACTS[station].items():
-            for stiffness in contacts:
+            for stiffness, step in itertools.product(contacts, ENGINE_STEPS if station == "mujoco" else STEPS[task]):
                 if args.task in (None, task) and args.station in (None, station):
-                    cases.setdefault((task, station, stiffness), Case(task, station, stiffness))
+                    cases.setdefault((task, station, stiffness, step), Case(task, station, stiffness, step))
     table = list(cases.values())
-    if args.measure:
-        for case in table:
-            if case.station != "arm":  # the contact is that of the gantry
-                modulus = CONTACTS[case.station][case.task][case.stiffness]
-                stiffness = measured_stiffness(case.task, case.station, modulus)
-                print(f"{case.task}, {case.station}, factor {modulus:g} of the modulus: {stiffness:.0f} N/mm")
-        return 0
 
     def report(name: str, episode: str) -> None:
         if args.out is not None:
             args.out.with_name(f"{args.out.stem}-{name}.json").write_text(episode)
 
     searches: dict[int, dict[str, Search]] = {number: {} for number in range(len(table))}
+    shares = [1 if case.station == "mujoco" or case.step_ms == STEPS[case.task][0] else FINE_SHARE for case in table]
     steps = min(ROUND, max(args.steps // len(table), 1))
     while (remaining := args.steps - sum(case.control_steps for case in table)) > 0:
-        number = min(range(len(table)), key=lambda index: table[index].control_steps)
+        number = min(range(len(table)), key=lambda index: table[index].control_steps * shares[index])
         run_round(table[number], searches[number], min(steps, remaining), args.bounded == "true", report)
         if args.out is not None:
             write(table, args.out)

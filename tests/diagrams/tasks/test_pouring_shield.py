@@ -13,7 +13,6 @@ from guiderail.diagrams.tasks.pouring import (
     frames_of,
     make_template,
     scripted_pour,
-    scripted_pour_from_above,
 )
 
 PERIOD = 0.01
@@ -60,19 +59,13 @@ def test_pour_line_is_at_the_observed_mug(template):
     assert np.allclose(frames["behind_mug"].translation()[:2], [0.0, template.parameters["behind_m"]])
 
 
-@pytest.mark.parametrize(
-    ("policy", "ending"),
-    [
-        (scripted_pour_from_above, "success"),
-        (scripted_pour, "spill"),
-    ],
-)
-def test_scripted_policy_pours_or_spills(policy, ending):
-    env = make_env("Pouring", guidance="sct", reward="shaped", difficulty="thesis")
+@pytest.mark.parametrize(("options", "ending"), [({}, "success"), ({"pour_distance": 0.1}, "spill")])
+def test_scripted_policy_pours_or_spills(options, ending):
+    env = make_env("Pouring", guidance="sct", reward="shaped", difficulty="thesis", **options)
     observation, _ = env.reset(seed=5)
     is_over = False
     while not is_over:
-        observation, _, terminated, truncated, info = env.step(policy(observation).astype(np.float32))
+        observation, _, terminated, truncated, info = env.step(scripted_pour(observation).astype(np.float32))
         is_over = terminated or truncated
     assert info["termination"] == ending
 

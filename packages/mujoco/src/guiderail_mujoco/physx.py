@@ -10,11 +10,12 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.workcell import Box, Cylinder, Hull, Spring, Surface
+from guiderail.diagrams.stations.workcell import Box, Hull, Spring, Surface
 from guiderail.models.common.arrays import cross
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail_mujoco.gantry import DivergedError, Input
 from guiderail_mujoco.rigid import SCALE, Body, RigidEngine, RigidStation
+from guiderail_mujoco.surfaces import prism
 from guiderail_mujoco.station import EngineOptions
 
 # Distance at which a contact of two shapes begins, half of it for each [m]. It is below the resolution of PhysX's
@@ -22,7 +23,6 @@ from guiderail_mujoco.station import EngineOptions
 # workpiece would slide past, such as a chamfer's: with 20 µm, drag is 1.5 times the friction at 40 mm/s.
 CONTACT_DISTANCE = 2e-8
 ITERATIONS = 100  # iterations of the solver; with 50, the lever arm on the rim depends on the order of contacts
-CYLINDER_SIDES = 120  # sides of the prism in place of a cylinder, which is no shape of PhysX's
 MAX_VERTICES = 255  # vertices of a convex hull in PhysX, which simplifies hulls that have more
 SPRING_RADIUS = 0.01  # radius of gyration of a spring's body, which cannot turn, and lever arm of its joints [m]
 NO_LIMIT = 1e9  # PhysX's own limit of a body's angular velocity is 100 rad/s
@@ -106,7 +106,7 @@ class PhysxEngine(RigidEngine):
         material = self._materials.setdefault(mu, physx.PhysxMaterial(mu, mu, 0.0))
         if isinstance(shape, Box):
             return physx.PhysxCollisionShapeBox([0.5 * SCALE * edge for edge in (shape.x, shape.y, shape.z)], material)
-        vertices = np.asarray(shape.vertices) if isinstance(shape, Hull) else _prism(shape)
+        vertices = np.asarray(shape.vertices) if isinstance(shape, Hull) else prism(shape)
         if len(vertices) > MAX_VERTICES:
             raise InputError(
                 f"a convex solid has at most {MAX_VERTICES} vertices in PhysX, and {surface.name} has {len(vertices)}"
@@ -193,13 +193,6 @@ class PhysxEngine(RigidEngine):
             if spring.is_on_tool:
                 self._body.add_force_at_point(-push, spring.entity.pose.p)
         self._scene.physx_system.step()
-
-
-def _prism(cylinder: Cylinder) -> np.ndarray:
-    """Return the vertices (2 N, 3) [m] of a prism in place of a cylinder."""
-    angle, half = 2.0 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES, np.full(CYLINDER_SIDES, cylinder.length / 2)
-    x, y = cylinder.radius * np.cos(angle), cylinder.radius * np.sin(angle)
-    return np.concatenate([np.column_stack([x, y, z]) for z in (-half, half)])
 
 
 @register_station("sapien", workcell_kind="insertion", options=EngineOptions)

@@ -34,7 +34,7 @@ from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail_mujoco.gantry import Engine, EngineGantry, MovedBodies
 from guiderail_mujoco.mujoco_engine import MujocoEngine
-from guiderail_mujoco.surfaces import surfaces_of
+from guiderail_mujoco.surfaces import prism, surfaces_of
 
 if TYPE_CHECKING:
     import mujoco
@@ -95,7 +95,7 @@ def mujoco_model(
     option.impratio = contact.friction_ratio
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.tolerance = 100, 1e-10
-    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # tolerance [m]; these contacts are 1 µm deep
+    option.ccd_iterations = 100  # enough for the largest hulls
 
     # The tool is added first, so that its joints are the first.
     tool = spec.worldbody.add_body(name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, **CENTERED)
@@ -173,12 +173,11 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
             damping=np.sqrt(spring.stiffness * mass),
         )
     shape, half = surface.shape, 0.5 * surface.pitch
-    if isinstance(shape, Hull):
+    if isinstance(shape, Hull | Cylinder):
         mesh = spec.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-        mesh.uservert = shape.vertices.ravel().tolist()
+        vertices = shape.vertices if isinstance(shape, Hull) else prism(shape)
+        mesh.uservert = vertices.ravel().tolist()
         kind: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": surface.name}
-    elif isinstance(shape, Cylinder):
-        kind = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [shape.radius, shape.length / 2, 0.0]}
     else:
         kind = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [shape.x / 2, shape.y / 2, shape.z / 2]}
     body.add_geom(

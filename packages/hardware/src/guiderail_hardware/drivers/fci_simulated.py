@@ -127,7 +127,7 @@ class WorkcellSimulator(MujocoSimulator):
         root = self.scene
         option = root.find("option")
         assert option is not None
-        option.attrib.update(cone="elliptic", impratio="10", ccd_tolerance="1e-9", ccd_iterations="100")
+        option.attrib.update(cone="elliptic", impratio="10", ccd_iterations="100")
         for joint in root.iterfind(".//joint[@frictionloss]"):  # in the default class, and in the wrist's joints
             joint.set("frictionloss", str(self._joint_friction))
         asset = root.find("asset")
