@@ -275,13 +275,14 @@ def _pouring_endings(tables: Path) -> list[Entry]:
     names = {"rl_sparse": "RL-Sparse", "rl_shaped": "RL-Shaped", "rl_sct_sparse": "RL-SCT-Sparse",
              "rl_sct_shaped": "RL-SCT-Shaped"}  # fmt: skip
     found = []
-    for algorithm, number in (("sac", "3.5"), ("tqc", "3.6")):
+    for algorithm, number, claimed in (("sac", "3.5", (1200, 600)), ("tqc", "3.6", (700, 1000))):
+        claims = dict(zip(names, ("never", *claimed, 250), strict=True))
         name = f"thesis_pouring_{algorithm}"
         table = _read(tables, name)
         ours: list[str] = []
         stored: tuple[str, ...] = (f"studies/{name}.yaml",)
         stored += () if table is None else (f"reproduction/tables/{name}.csv",)
-        ended = dict.fromkeys(names, 0)
+        ended, complete = dict.fromkeys(names, 0), []
         for method, label in names.items() if table is not None else ():
             runs = _runs_of(table, method)
             if runs:
@@ -289,6 +290,13 @@ def _pouring_endings(tables: Path) -> list[Entry]:
                 ended[method] = sum(
                     c is not None or len(run) == LONGEST for c, run in zip(converged, runs, strict=True)
                 )
+                if ended[method] == 10:
+                    within = (
+                        "never"
+                        if None in converged
+                        else f"after {max(c for c in converged if c is not None)} or fewer episodes"
+                    )
+                    complete.append(f"{within} with {label} (thesis: {claims[method]})")
                 ours.append(
                     f"{label}, {len(runs)} of 10 runs so far, episodes done {_each(runs, len)}, episodes until ten "
                     f"successes in a row {_convergence(runs, LONGEST)}, spills "
@@ -301,7 +309,8 @@ def _pouring_endings(tables: Path) -> list[Entry]:
         found.append(
             Entry(
                 (number,),
-                f"{OPEN}: {min(ended.values())} of 10 runs of every setting have ended",
+                f"{OPEN}: {', '.join(f'{number} of 10 runs of {names[method]}' for method, number in ended.items())} "
+                "have ended" + "".join(f"; ten successes in a row begin {text}" for text in complete),
                 "episodes until ten successes in a row; spills and collisions per episode",
                 tuple(ours) or ("no run yet",),
                 f"{sum(ended.values())} of 40 ended (40)",

@@ -1,4 +1,4 @@
-"""Adversarial actions against the force limit: random, held, extreme and bang-bang, and a search over whole episodes.
+"""Adversarial actions against the force limit: drops, random, held, extreme, bang-bang, and a search over episodes.
 
     python tests/harness/force_adversary.py --steps 100000 --out forces.csv  # ten minutes of one core
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
@@ -68,7 +68,8 @@ FINE_SHARE = 5  # a case with a finer step gets one in this number of control st
 RIM = {"BncConnector": 0.004, "GridClamp": 0.005}  # distance from the target at which the workpiece is on the rim [m]
 FRICTION_FACTORS = (0.5, 1.0, 2.0)
 REACH = np.array([0.008, 0.008, 0.025, 0.3, 0.1, 0.1])  # of `Anywhere` from the start [m], [rad]
-ATTACKS = ("random", "constant", "extreme", "bang_bang")
+ATTACKS = ("random", "constant", "extreme", "bang_bang", "drop")
+DROP = 8  # number of actions down, and up again
 LIMITS = (8.0, 25.0)  # range of sampled force limits [N]
 PAYLOADS = (0.0, 0.25, 0.5)  # a weight of up to 5 N, the largest that is not refused before a motion [kg]
 JOINT_FRICTIONS = (0.0, 0.3, 0.7)  # of each joint of the arm [Nm]
@@ -207,6 +208,11 @@ class Anywhere(Law):
 
 def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
     """Return a function that returns the next action (size,) of an attack."""
+    if kind == "drop":  # onto the rim, at a random place and with a small tilt
+        angle, number = rng.uniform(0.0, 2.0 * np.pi), itertools.count()
+        held = rng.uniform(-0.3, 0.3, size)
+        held[:2] = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
+        return lambda: np.where(np.arange(size) == 2, 1.0 if next(number) // DROP % 2 else -1.0, held)
     constant = rng.uniform(-1.0, 1.0, size) if kind == "constant" else rng.choice([-1.0, 1.0], size)
     if kind in ("constant", "extreme"):
         return lambda: constant

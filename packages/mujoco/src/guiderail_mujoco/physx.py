@@ -15,8 +15,8 @@ from guiderail.models.common.arrays import cross
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail_mujoco.gantry import DivergedError, Input
 from guiderail_mujoco.rigid import SCALE, Body, RigidEngine, RigidStation
-from guiderail_mujoco.surfaces import prism
 from guiderail_mujoco.station import EngineOptions
+from guiderail_mujoco.surfaces import prism
 
 # Distance at which a contact of two shapes begins, half of it for each [m]. It is below the resolution of PhysX's
 # coordinates, so contacts begin when shapes touch. A contact that begins earlier has the normal of a face that the
