@@ -314,6 +314,14 @@ def test_disturbed_period_is_a_multiple_of_the_engine_step():
         make_env("GridClamp", station="mujoco", disturbances={"clock_factor": 1.5}, time_step=0.02)
 
 
+@pytest.mark.parametrize("workcell", [BncWorkcell, GridClampWorkcell])
+def test_all_shapes_are_polyhedra(workcell):
+    """MuJoCo's contacts of a cylinder's edge with polyhedra began up to 1.5 mm deep (`surfaces.CYLINDER_SIDES`)."""
+    model = MujocoStation(workcell()).gantry.engine.model
+    polyhedra = {int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)}
+    assert set(model.geom_type.tolist()) <= polyhedra
+
+
 def test_set_pose_raises_when_the_pose_is_not_finite():
     station = MujocoStation(CONNECTOR)
     context, zero = station.CreateDefaultContext(), np.zeros(6)
