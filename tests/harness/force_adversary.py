@@ -41,7 +41,7 @@ from scipy.integrate import solve_ivp
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
-from guiderail.models.control.wrench import FORCE_SHARES, approach_impedance, impact_ratio
+from guiderail.models.control.wrench import FORCE_SHARES, PRESSED, approach_impedance, impact_ratio
 from guiderail.models.laws.law import Command, Law
 from guiderail_mujoco.station import MujocoContact
 
@@ -147,7 +147,7 @@ def transient_bound(
     """
     ratio = stiffness / CONTACT_STIFFNESS
     pressed = peak(ratio, heavier, 1.0, damping)
-    turned = peak(ratio, heavier * share, 1.5 * share, damping)
+    turned = peak(ratio, heavier * share, (2.0 - PRESSED) * share, damping)
     return max(pressed, turned) + delay * math.sqrt(stiffness / mass)
 
 
@@ -459,14 +459,8 @@ def largest_stiffness(task: str, modulus: float) -> float:
     station, root = station_of(env), env.simulator.get_mutable_context()
     station.set_contact(root, 1.0, modulus)
     context = station.plant.GetMyMutableContextFromRoot(root)
-    start = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(root)) + [
-        RIM[task],
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    ]
+    pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(root))
+    start = pose + RIM[task] * np.eye(6)[0]
 
     def force(depth: float) -> float:
         station.set_pose(root, start - [0.0, 0.0, depth, 0.0, 0.0, 0.0])
