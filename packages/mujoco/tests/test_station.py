@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from pushed_station import push_robot
 from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
 
 from guiderail import InputError, make_env
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.stations.gantry import CARRIAGE_MASS
+from guiderail.diagrams.stations.station import CONTACT_STIFFNESS, Impedance
 from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.transforms import MM
+from guiderail.models.control.wrench import approach_impedance
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, poses
 from oracles.connector import insert_and_lock
 
@@ -134,7 +137,7 @@ def test_snap_force_peaks_at_the_lip(inserted):
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
     assert 2.0 < resistance < 8.0
-    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # past the lip, the clamp snaps in within a control step
+    assert z[np.flatnonzero(z < 0.85)[2]] < 0.1  # past the lip, the clamp snaps in within 30 ms
     assert recording["wrench"][:, 2].max() > resistance  # at the shoulder
 
 
@@ -297,8 +300,27 @@ def test_station_raises_when_its_engine_is_missing(station, engine, monkeypatch)
 
 def test_engine_step_is_rounded_to_a_fraction_of_the_time_step():
     for given, expected in ((0.0004, 0.01 / 25), (0.003, 0.01 / 3), (None, 0.001)):
-        engine = MujocoStation(CONNECTOR, engine_step=given).gantry.engine
+        engine = MujocoStation(CONNECTOR, time_step=0.01, engine_step=given).gantry.engine
         assert engine.time_step == engine.model.opt.timestep == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("control_period", [0.01, 0.02, 0.1])
+def test_tool_is_not_faster_than_the_bound_admits(control_period):
+    """With a time step of 10 ms, it would be 1.4 times as fast (`LONGEST_STEP`)."""
+    force = 20.0
+    impedance = Impedance().with_max_force(force)
+    station = MujocoStation(CONNECTOR, impedance, control_period=control_period)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    pose = np.array([0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    station.get_desired_pose_input_port().FixValue(context, pose + [0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
+    station.set_pose(context, pose)
+    speeds = []
+    for i in range(1, 200):
+        simulator.AdvanceTo(i * station.time_step)
+        state = station.gantry.get_state_output_port().Eval(station.gantry.GetMyContextFromRoot(context))
+        speeds.append(np.linalg.norm(state[6:9]))
+    assert 0.9 < max(speeds) * approach_impedance(CONTACT_STIFFNESS, CARRIAGE_MASS) / force < 1.0
 
 
 def test_parts_with_more_pairs_than_mask_bits_are_refused():

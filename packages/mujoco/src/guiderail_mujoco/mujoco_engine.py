@@ -81,12 +81,13 @@ class MujocoEngine:
         # first warning.
         for warning in self._failures:
             data.warning[warning].number = 1
-        wrenches = []
+        generalized, axes = [], []
         for _ in range(num_substeps * num_steps):
             self._mujoco.mj_step(model, data)
-            self._check_warnings()
-            wrenches.append(self._contact_wrench())
-        return self._engine_state(), np.array(wrenches), float(model.opt.timestep)
+            generalized.append(data.qfrc_constraint[:POSE_SIZE].copy())
+            axes.append(data.xaxis[3:POSE_SIZE].copy())
+        self._check_warnings()
+        return self._engine_state(), _contact_wrenches(np.array(generalized), np.array(axes)), model.opt.timestep
 
     def _check_warnings(self) -> None:
         numbers = self._data.warning.number[self._failures]
@@ -116,11 +117,11 @@ class MujocoEngine:
         model.geom_solref[:, 0] = np.maximum(constants, 2.0 * model.opt.timestep)
         return num_substeps
 
-    def _contact_wrench(self) -> np.ndarray:
-        """Return the wrench of the generalized contact forces.
 
-        The prismatic joints are along the axes of T. For a torque t, the generalized force of a hinge about an axis a
-        is a · t.
-        """
-        generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
-        return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
+def _contact_wrenches(generalized: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the wrenches (N, 6) of generalized contact forces (N, 6) on joints with the axes (N, 3, 3) of the hinges.
+
+    The prismatic joints are along the axes of T. For a torque t, the generalized force of a hinge about an axis a is
+    a · t.
+    """
+    return np.hstack([generalized[:, :3], np.linalg.solve(axes, generalized[:, 3:, None])[..., 0]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,6 @@ from guiderail.diagrams.stations.options import ContactOptions
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
-    PLANT_PERIOD,
     WRENCH_TIME_CONSTANT,
     Impedance,
     Station,
@@ -47,6 +47,11 @@ CENTERED: dict[str, Any] = {"ipos": [0.0, 0.0, 0.0], "explicitinertial": True}  
 MakeEngine = Callable[[list[Surface], list[Surface], SpatialInertia, Impedance, float], Engine]
 """Function from the surfaces of fixture and workpiece, the workpiece's inertia, the impedance and the station's time
 step [s] to an engine."""
+
+LONGEST_STEP = CONTROL_PERIOD / 5
+"""Longest default time step of a station [s]. The engine integrates the governed spring over it, so that a step from
+rest must not make the tool faster than F / c (`slow_down`): v = F (1 − exp(−D h / m)) / D is 0.91 F / c for the
+smallest mass m = 1.5 kg and the default damping D. Half of `CONTROL_PERIOD` would permit 1.9 F / c."""
 
 MAX_PAIRS = 31  # number of bits of a contact mask, a signed integer of 32 bits, without the sign
 
@@ -222,7 +227,7 @@ class EngineStation(Station):
         The other arguments and errors are those of `MujocoStation`.
         """
         super().__init__()
-        time_step = PLANT_PERIOD if time_step is None else time_step
+        time_step = control_period / math.ceil(control_period / LONGEST_STEP - 1e-9) if time_step is None else time_step
         control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
         surfaces = surfaces_of(workcell)
@@ -292,7 +297,7 @@ class MujocoStation(EngineStation):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Period of inputs and outputs [s]; half of `CONTROL_PERIOD` by default. The engine steps faster.
+            time_step: Period of inputs and outputs [s]; at most `LONGEST_STEP` by default. The engine steps faster.
             contact: Parameters of contact and integration.
             control_period: Time between commands [s], a whole multiple of the time step.
             engine_step: Time step of the engine [s] instead of that of `contact`.
