@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -142,7 +143,9 @@ class BncWorkcell(MovableWorkcell):
     workpiece: ClassVar[str] = "plug"
     time_step = CONTROL_PERIOD / 4
     # Pairs of surfaces that cannot touch in a connector of these dimensions, or whose contact another pair models.
-    filtered_pairs = tuple(((name,), tuple({*TOUCHING.values()} - {touched})) for name, touched in TOUCHING.items())
+    filtered_pairs = tuple(
+        ((name,), tuple({*itertools.chain(*TOUCHING.values())} - {*touched})) for name, touched in TOUCHING.items()
+    )
     dimensions: BncDimensions = field(default_factory=BncDimensions)  # dimensions of the connector
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the jack, (3,) [m]
     friction: float = FRICTION  # friction coefficient of the connector's metal

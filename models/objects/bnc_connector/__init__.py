@@ -7,9 +7,10 @@ end, and x through the lugs. The origin of the plug frame P is the center of the
 to the cable, and x through the entries of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by
 minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
-Contact. The ring has three open rigid surfaces: the mouth's flat face, and its chamfer with the bore, which collide
-only with the barrel, and a pair of slots that collide only with the lugs. These surfaces have a third of the triangles
-of a closed ring, and their contact is computed five times faster. The corner between face and chamfer is a lip, a
+Contact. The ring has open rigid surfaces: the mouth's flat face, and its chamfer with the bore, which collide only with
+the barrel, a pair of slots that collide only with the lugs, and the outer wall, for a plug that is moved into the jack
+from the side. The first three have a third of the triangles of a closed ring, and their contact is computed five times
+faster. The corner between face and chamfer is a lip, a
 shallow cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant
 primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their detents.
 
@@ -202,6 +203,11 @@ def bore_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return _lathe([_lip_edge(d), corner, (d.bore_radius, d.mouth_chamfer), (d.bore_radius, d.ring_length)])
 
 
+def side_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the outer wall of the ring, above the distance at which its face touches the barrel."""
+    return _lathe([(dimensions.ring_radius, dimensions.ring_length), (dimensions.ring_radius, 2.0 * MARGIN)])
+
+
 def _lip_edge(d: BncDimensions) -> tuple[float, float]:
     return d.bore_radius + d.mouth_chamfer + LIP_WIDTH, 0.0
 
@@ -266,10 +272,13 @@ SEAT = ContactMaterial(friction=0.05)
 
 PLUG_MASS = 0.03  # [kg]
 
-TOUCHING: dict[str, str] = {
-    "barrel": "bore", "barrel_end": "face", "lug_0": "slots", "lug_1": "slots", "pad": "seat",
+# Without the side, the face entered the barrel from outside at any depth, and its contact, which only lifts, threw the
+# plug out: the face's normal is perpendicular to the gradient of the barrel's pressure, which Drake accepts.
+TOUCHING: dict[str, tuple[str, ...]] = {
+    "barrel": ("bore",), "barrel_end": ("face",), "lug_0": ("slots", "side"), "lug_1": ("slots", "side"),
+    "pad": ("seat",), "barrel_side": ("side",),
 }  # fmt: skip
-"""Surface of the plug that each surface of the jack can touch."""
+"""Surfaces of the plug that each surface of the jack can touch."""
 
 
 def barrel_sides(dimensions: BncDimensions) -> int:
@@ -298,6 +307,7 @@ def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     for number, sign in enumerate((1.0, -1.0)):
         lug = (sdf.at(x=sign * lug_center, z=d.lug_height, pitch=np.pi / 2), sdf.cylinder(d.lug_radius, lug_length))
         contents += sdf.collision(f"lug_{number}", *lug, lug_material) + sdf.visual(f"lug_{number}_visual", *lug, BRASS)
+    contents += sdf.collision("barrel_side", center, barrel, replace(side, margin=MARGIN))
     return sdf.model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 
 
@@ -313,6 +323,7 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
         sdf.collision(name, sdf.at(), sdf.mesh(f"bnc_{name}.obj"), ring) for name in ("face", "bore", "slots")
     )
     contents += sdf.collision("seat", *seat, SEAT)
+    contents += sdf.collision("side", sdf.at(), sdf.mesh("bnc_side.obj"), ring)
     contents += sdf.visual("ring_visual", sdf.at(), sdf.mesh("bnc_ring.obj"), NICKEL)
     contents += sdf.visual("shell_visual", *shell, BRASS)
     return sdf.model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
@@ -324,6 +335,7 @@ def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, st
         "bnc_face.obj": face_mesh(dimensions).to_obj(),
         "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
+        "bnc_side.obj": side_mesh(dimensions).to_obj(),
         "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
         "bnc_jack.sdf": jack_sdf(dimensions, friction),
         "bnc_plug.sdf": plug_sdf(dimensions, friction),

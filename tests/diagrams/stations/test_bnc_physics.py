@@ -23,6 +23,7 @@ CASES = {"standard": (WORKCELL, 15.0), "hard": (HARD_WORKCELL, HARD.collision.ab
 ENTRY_BOTTOM = (
     WORKCELL.dimensions.lug_height - WORKCELL.dimensions.entry_height - WORKCELL.dimensions.locked_height
 ) / MM
+BARREL, LUG_TIP = WORKCELL.dimensions.barrel_radius, WORKCELL.dimensions.lug_tip_radius
 JACK = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM, 0.0, 0.0, 0.0])  # pose of the moved jack and of its motions
 
 
@@ -126,6 +127,18 @@ def test_plug_does_not_tunnel_at_the_effort_limit(z_mm, yaw_deg):
     floor = lug_top(WORKCELL) if yaw_deg == 45.0 else ENTRY_BOTTOM
     assert recording["wrench"][-1, 2] == pytest.approx(40.0, abs=0.5)
     assert recording["pose"][-1, 2] > (floor - 0.6) * MM
+
+
+@pytest.mark.parametrize(
+    ("axis", "z_mm", "jack_radius"), [(0, 2.5, BARREL), (0, 8.9, BARREL), (1, 2.5, LUG_TIP), (1, 8.9, BARREL)]
+)
+def test_plug_from_the_side_stops_at_the_jack(axis, z_mm, jack_radius):
+    """Without the ring's outer wall, its face entered the barrel, whose contact threw the plug out."""
+    motion = np.zeros((3, 6))
+    motion[:, axis], motion[:, 2] = np.array([-14.0, -10.0, -8.0]) * MM, z_mm * MM
+    pose = drive_along(GantryStation(WORKCELL), np.array([0.0, 0.5, 1.0]), motion)[1]["pose"]
+    assert pose[-1, axis] == pytest.approx(-WORKCELL.dimensions.ring_radius - jack_radius, abs=0.06 * MM)
+    assert np.abs(pose[:, 2] - motion[0, 2]).max() < 0.01 * MM
 
 
 def test_lugs_do_not_tunnel_at_the_effort_limit():
