@@ -223,17 +223,20 @@ def test_numbers_of_the_jerk():
     assert f"in free space | command | {linear:.1f} | {angular:.0f} |" in page()
 
 
-def test_shaped_template_converges_in_ten_runs_of_figure_3_5():
-    runs = [run for _, run in table("thesis_pouring_sac").query("method == 'rl_sct_shaped'").groupby("seed")]
+@pytest.mark.parametrize(("figure", "study"), [("3.5", "thesis_pouring_sac"), ("3.6", "thesis_pouring_tqc")])
+def test_shaped_template_converges_in_ten_runs(figure, study):
+    runs = [run for _, run in table(study).query("method == 'rl_sct_shaped'").groupby("seed")]
     assert len(runs) == 10
     assert all(run["success"].iloc[-10:].all() and not (run["termination"] == "collision").any() for run in runs)
-    assert f"after {max(len(run) for run in runs) - 10} or fewer episodes with RL-SCT-Shaped (thesis: 250)" in page()
+    verdict = next(line for line in PAGE.read_text("utf-8").splitlines() if line.startswith(f"| Figure {figure} |"))
+    assert f"after {max(len(run) for run in runs) - 10} or fewer episodes with RL-SCT-Shaped (thesis: 250)" in verdict
 
 
 def test_hours_are_those_of_the_stored_runs():
     rows = [rows_of("pouring_sac", "rl_sct_shaped")["training_wall_time"]]
     rows += [rows_of("connector_10hz", method)["training_wall_time"] for method in ("kgrl", "skgrl")]
-    names = ("thesis_pouring_sac", "pouring_hard_shield", "thesis_grid_clamp", "thesis_narrow_passage")
+    names = ("thesis_pouring_sac", "thesis_pouring_tqc", "pouring_hard_shield", "thesis_grid_clamp")
+    names += ("thesis_narrow_passage",)
     rows += [table(name)["wall_time"] for name in names]
     rows += [rows_of("narrow_passage_images", "kgrl")["wall_time"]]
     assert f"took {sum(own.sum() for own in rows) / 3600:.1f} hours" in page()
