@@ -208,9 +208,9 @@ class Anywhere(Law):
 
 def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
     """Return a function that returns the next action (size,) of an attack."""
-    if kind == "drop":  # onto the rim, at a random place and with a small tilt
+    if kind == "drop":  # onto the rim, at a random place, upright (the stiffest contact) or with a small tilt
         angle, number = rng.uniform(0.0, 2.0 * np.pi), itertools.count()
-        held = rng.uniform(-0.3, 0.3, size)
+        held = rng.uniform(-0.3, 0.3, size) * rng.choice([0.0, 1.0])
         held[:2] = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
         return lambda: np.where(np.arange(size) == 2, 1.0 if next(number) // DROP % 2 else -1.0, held)
     constant = rng.uniform(-1.0, 1.0, size) if kind == "constant" else rng.choice([-1.0, 1.0], size)
