@@ -78,6 +78,11 @@ class Rig:
         return ArmState(int(self["arm_state"][0]))
 
     @property
+    def state(self):
+        """Return arm state, fault, time in the state, blend factor, speed at the stop, and 1 if the hold is refused."""
+        return self.context.get_discrete_state().value(0).copy()
+
+    @property
     def fault(self):
         return Fault(int(self["fault"][0]))
 
@@ -444,6 +449,94 @@ def test_initialization_stops_an_arm_that_is_controlled(plant, arm_state, time):
     np.testing.assert_allclose(rig["safe_torque"], np.clip(rig.damping(), -20.0, 20.0), atol=1e-12)
     rig.advance(LIMITS.damping_time + 2 * PERIOD)
     assert (rig.arm_state, rig.fault) == (ArmState.OFF, Fault.INITIALIZED)
+
+
+LARGEST = SPEED.max()
+BEFORE = [Fault.STALE, 0.3, 0.0, 0.7, 0.0]  # of a stopped arm, behind its state
+START = [ArmState.WAITING, Fault.NONE, 0.0, 0.0, 0.0, 0.0]
+CALLS = [
+    ("stop", START, [ArmState.OFF, Fault.USER_STOP, np.inf, 0.0, 0.0, 0.0]),
+    *(
+        ("stop", [state, Fault.NONE, 0.3, 0.5, 0.7, 1.0], [ArmState.DAMPING, Fault.USER_STOP, 0.0, 0.0, LARGEST, 0.0])
+        for state in (ArmState.RAMPING, ArmState.RUNNING)
+    ),
+    *(("stop", [state, *BEFORE], [state, *BEFORE]) for state in (ArmState.DAMPING, ArmState.OFF)),
+    *(
+        ("damp_again", [state, *BEFORE[:-1], refused], [ArmState.DAMPING, Fault.STALE, 0.0, 0.0, LARGEST, refused])
+        for state in (ArmState.DAMPING, ArmState.OFF)
+        for refused in (0.0, 1.0)
+    ),
+    *(("refuse_hold", [state, *BEFORE], [state, *BEFORE[:-1], 1.0]) for state in (ArmState.DAMPING, ArmState.OFF)),
+    *(
+        (call, [state, Fault.NONE, 0.3, 0.5, 0.7, 0.0], [state, Fault.NONE, 0.3, 0.5, 0.7, 0.0])
+        for call in ("damp_again", "refuse_hold")
+        for state in (ArmState.WAITING, ArmState.RAMPING, ArmState.RUNNING)
+    ),
+    ("resume", [ArmState.OFF, Fault.STALE, 0.3, 0.5, 0.7, 1.0], [ArmState.RAMPING, Fault.NONE, 0.0, 0.0, 0.0, 0.0]),
+    ("initialize", [ArmState.RUNNING, *BEFORE], [ArmState.DAMPING, Fault.INITIALIZED, 0.0, 0.0, LARGEST, 0.0]),
+]
+
+
+@pytest.mark.parametrize(("call", "before", "after"), CALLS)
+def test_state_after_a_call(plant, call, before, after):
+    rig = Rig(plant, running=False)
+    assert list(rig.state) == START
+    rig.context.SetDiscreteState(0, before)
+    if call == "initialize":
+        rig.simulator.Initialize()
+    else:
+        getattr(rig.system, call)(rig.context)
+    assert list(rig.state) == after
+
+
+@pytest.mark.parametrize(
+    ("velocity", "speed"), [([-0.7, 0.2], 0.7), ([0.2, np.inf], 0.2), ([-np.inf, 0.2], 0.2), ([np.nan, 0.2], 0.2)]
+)
+def test_speed_of_a_stop_is_the_largest_known_one(plant, velocity, speed):
+    rig = Rig(plant)
+    rig.set(velocity=[*velocity, *np.zeros(n - 2)])
+    rig.system.stop(rig.context)
+    assert rig.state[4] == speed
+
+
+@pytest.mark.parametrize(
+    ("initial", "speed", "is_ineffective"),
+    [(0.4, 0.2, False), (0.4, 0.2001, True), (0.0, 0.05, False), (0.0, 0.0501, True), (0.4, np.nan, False)],
+)
+def test_arm_that_its_driver_does_not_hold_is_damped(plant, initial, speed, is_ineffective):
+    """An arm must have half of its speed, or 0.05 rad/s, within 50 ms."""
+    rig, steps = Rig(plant, can_hold=True), 13
+    rig.set(status_fault=[Fault.STALE], velocity=[initial, *np.zeros(n - 1)])
+    rig.advance(PERIOD)
+    rig.set(reported_speed=[speed], velocity=SPEED)
+    rig.advance((steps - 1) * PERIOD)
+    assert (steps - 1) * PERIOD < 0.05 <= steps * PERIOD
+    assert (rig["is_holding"][0], rig["safe_torque"].any()) == (1.0, False)
+    rig.advance(PERIOD)
+    state_time, refused = (0.0, 1.0) if is_ineffective else (steps * PERIOD, 0.0)
+    assert list(rig.state) == [ArmState.DAMPING, Fault.STALE, state_time, 0.0, initial, refused]
+    assert rig["is_holding"][0] == 1.0 - refused
+    np.testing.assert_allclose(rig["safe_torque"], refused * np.clip(rig.damping(), -20.0, 20.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "is_refused"), [(0.15 - 1e-9, False), (np.nextafter(0.15 - 1e-9, 0.0), True)])
+def test_arm_must_be_at_rest_for_the_rest_time(plant, time, is_refused):
+    rig = Rig(plant)
+    rig.context.SetDiscreteState(0, [ArmState.OFF, *BEFORE])
+    rig.context.SetDiscreteState(1, [time])
+    with pytest.raises(InputError, match="it moves") if is_refused else contextlib.nullcontext():
+        rig.system.resume(rig.context)
+
+
+@pytest.mark.parametrize(("speed", "rest_time"), [(0.15, 1.0 + PERIOD), (np.nextafter(0.15, 1.0), 0.0)])
+@pytest.mark.parametrize("signal", ["velocity", "reported_speed"])
+def test_rest_time_begins_again_at_the_rest_speed(plant, signal, speed, rest_time):
+    rig = Rig(plant)
+    rig.context.SetDiscreteState(1, [1.0])
+    rig.set(velocity=np.zeros(n))
+    rig.set(**{signal: [speed, *np.zeros(n - 1)] if signal == "velocity" else [speed]})
+    rig.advance(PERIOD)
+    assert rig.context.get_discrete_state().value(1).item() == rest_time
 
 
 def test_initialization_continues_a_stop(plant):

@@ -10,7 +10,6 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import check_plant
 from guiderail_hardware.models.joint_dynamics import JointDynamics
 from guiderail_hardware.models.joint_status import JointStatus, StatusLimits
 from guiderail_hardware.models.state_estimator import Estimate, EstimatorState, StateEstimator
@@ -61,7 +60,6 @@ class StatusWatchdog(LeafSystem):
         self, plant: MultibodyPlant, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float
     ):
         super().__init__()
-        check_plant(plant)
         self._estimator = StateEstimator(limits, torque_tolerance, period=period)
         self._dynamics, self._num_joints = JointDynamics(plant), plant.num_positions()
         n = self._num_joints

@@ -10,7 +10,6 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import check_plant
 from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault, damping_torque, is_hold_ineffective
 
 # Indices into the discrete state [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
@@ -149,8 +148,6 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float, can_hold: bool = False):
         super().__init__()
-        declare.check_period(period)
-        check_plant(plant)
         num_joints = plant.num_positions()
         if len(limits.velocity) != num_joints:
             raise InputError(f"an arm of {num_joints} joints needs as many limits, not {len(limits.velocity)}")
