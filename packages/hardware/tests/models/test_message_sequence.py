@@ -124,9 +124,33 @@ def test_moving_and_resting_robot_conflict_when_their_clocks_are_close(offset):
 @pytest.mark.parametrize(("late", "is_conflict"), [(0, True), (1, False)])
 def test_clocks_must_return_within_the_maximum_number_of_statuses(late, is_conflict):
     """The senders change after 200 statuses, or after 201."""
-    run = module.MAX_RETURN + late
+    run = 200 + late
     times = [1.0 + n * PERIOD + 1e4 * (n // run % 2) for n in range(3 * run + 1)]
     assert status_conflicts(*(status(t, 0.0) for t in times)) == is_conflict
+
+
+@pytest.mark.parametrize(("jump", "is_conflict"), [(1.0, False), (1.0005, True)])
+def test_clocks_alternate_if_they_differ_by_more_than_the_maximum_interval(jump, is_conflict):
+    assert status_conflicts(*(status(1.0 + MAX_DELAY * jump * (n % 2), 0.0) for n in range(4))) == is_conflict
+
+
+@pytest.mark.parametrize(("share", "is_conflict"), [(1.0, True), (1.0005, False), (-1.0, True), (-1.0005, False)])
+def test_clock_returns_to_where_it_would_be_without_the_jump(share, is_conflict):
+    """One status later, a clock is within one period, and the delay of a message, of its time stamp before the jump."""
+    times = [1.0, 100.0, 1.0 + share * (PERIOD + MAX_DELAY), 100.0]
+    assert status_conflicts(*(status(t, 0.0) for t in times)) == is_conflict
+
+
+@pytest.mark.parametrize(("share", "is_conflict"), [(0.9999, False), (1.0001, True)])
+def test_reordered_statuses_of_two_velocities_conflict(share, is_conflict):
+    rates = np.array([1.0, 1.0 / 0.75]) / PERIOD
+    limit = (module.REVERSAL + 2.0 * module.RESOLUTION * rates.sum()) / (rates[1] - rates[0])
+    times, positions = 1.0 + PERIOD * np.array([0.0, 1.0, 0.25]), [0.0, share * limit, 0.0]
+    assert status_conflicts(*(status(*each) for each in zip(times, positions, strict=True))) == is_conflict
+
+
+def test_short_intervals_before_and_after_a_jump_do_not_conflict():
+    assert status_conflicts(*(status(t, 0.0) for t in [2.0, 2.0 + 0.25 * PERIOD, 1.0, 1.0 + 0.25 * PERIOD])) == 0
 
 
 def test_two_short_intervals_conflict_when_time_stamps_go_back():

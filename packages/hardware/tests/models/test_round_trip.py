@@ -78,24 +78,37 @@ def test_lost_commands_are_no_latency():
     assert run(1, 23, lost={20, 21}).seconds == pytest.approx(PERIOD)
 
 
-def test_commands_that_stay_unreported_increase_the_round_trip():
+@pytest.mark.parametrize("steps", [10, 25])
+def test_commands_that_stay_unreported_increase_the_round_trip(steps):
     round_trip = run(1, 20)
-    for step in range(20, 30):
+    for step in range(20, 20 + steps):
         round_trip.update((to_microseconds(18 * PERIOD),), step * PERIOD)
         round_trip.add_command(step * PERIOD, step * PERIOD)
-    assert round_trip.seconds == pytest.approx((10 - WINDOW + 1) * PERIOD)
+    assert round_trip.seconds == pytest.approx((steps - WINDOW + 1) * PERIOD)
 
 
-def test_round_trip_is_unknown_after_the_last_command():
-    round_trip = run(1, 20)
-    round_trip.update((), 19 * PERIOD + 0.99 * EXPIRY)
-    assert np.isfinite(round_trip.seconds)
-    round_trip.update((), 19 * PERIOD + 1.01 * EXPIRY)
-    assert np.isnan(round_trip.seconds)
-    assert round_trip.longest >= PERIOD
+@pytest.mark.parametrize(("elapsed", "is_known"), [(0.1, True), (np.nextafter(0.1, 1.0), False)])
+def test_round_trip_is_unknown_after_the_last_command(elapsed, is_known):
+    round_trip = RoundTrip()
+    for stamp in (0.0, 1.0):
+        round_trip.add_command(stamp, 0.0)
+    round_trip.update({0}, 0.005)
+    round_trip.update({0}, elapsed)
+    assert np.isfinite(round_trip.seconds) == is_known
+    assert round_trip.longest == 0.005
+
+
+def test_measurement_begins_again_after_the_last_command():
+    round_trip, start = run(1, 20), 20 * PERIOD + 2.0 * EXPIRY
+    for step in range(WINDOW + 1):
+        round_trip.update((), start + step * PERIOD)
+        assert np.isnan(round_trip.seconds) == (step < WINDOW)
+        round_trip.add_command(start + step * PERIOD, start + step * PERIOD)
+    assert round_trip.seconds == pytest.approx(PERIOD)
 
 
 def test_time_stamp_that_is_not_finite_is_unknown():
+    assert to_microseconds(1.0) == 1_000_000
     assert (to_microseconds(np.nan), to_microseconds(np.inf), to_microseconds(1.5e-6)) == (-1, -1, 2)
 
 
