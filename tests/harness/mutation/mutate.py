@@ -67,6 +67,10 @@ TARGETS = {
     "models/control/command_filters.py": ["tests/models/control/test_keep_out.py"],
     "models/control/wrench.py": [
         "tests/models/control/test_wrench.py",
+        "tests/models/control/test_cartesian_impedance.py",
+        "tests/systems/test_reference_governor.py",
+        "tests/systems/test_phase_wrench_limit.py",
+        "tests/systems/test_energy_tank.py",
         "tests/systems/test_center_of_pressure.py",
         "tests/systems/test_mean_contact_point.py",
         "tests/systems/test_wrench_sensor.py",
