@@ -97,6 +97,9 @@ TARGETS = {
         for path in sorted((ROOT / HARDWARE / "src/guiderail_hardware/systems").glob("*.py"))
         if path.stem != "__init__"
     },
+    "packages/studies/src/guiderail_studies/certificate/checker.py": [
+        "packages/studies/tests/certificate/test_certificate.py"
+    ],
     "packages/lerobot/src/guiderail_lerobot/chunk_safety_limiter.py": [
         "packages/lerobot/tests/test_chunk_safety_limiter.py"
     ],
