@@ -19,6 +19,7 @@ from guiderail.models.control.wrench import (
     governed_error,
     impact_ratio,
     norm_limits,
+    slow_down,
     spring_energy,
 )
 
@@ -157,6 +158,36 @@ def test_impact_ratio_bounds_a_contact_that_a_tool_presses_on_while_it_turns(rat
         assert largest >= 0.999 * impact_ratio(ratio, share)
 
 
+def test_impact_ratio_has_its_closed_form():
+    assert approach_impedance(2.5e4, 1.5) ** 2 == pytest.approx(4.0 * 2.5e4 * 1.5, rel=1e-12)
+    assert impact_ratio(2.0, 1e-6) == pytest.approx(1.0 + np.sqrt(0.5) * np.exp(-0.75 * np.pi), rel=1e-12)
+    assert impact_ratio(1.0) == 1.5
+    assert impact_ratio(8.0) == impact_ratio(8.0, 1.0) != impact_ratio(8.0, 0.999)
+
+
+def test_shares_of_a_moving_tool_are_those_of_the_two_inequalities():
+    """The inequalities in `slow_down`, with the shares of force and torque for which they are equations."""
+    rng, reduced = np.random.default_rng(6), []
+    for _ in range(400):
+        spring, velocity = rng.normal(size=6) * np.repeat([8.0, 0.5], 3), rng.normal(size=6) * np.repeat([0.01, 0.5], 3)
+        damping, push, turn = 200.0 * rng.random(6) * np.repeat([1.0, 1e-3], 3) * velocity, spring[:3], spring[3:]
+        c, F = 2.0 * np.sqrt(BOUND.contact_stiffness * INERTIA.mass), BOUND.force
+        speed, spin = np.linalg.norm(velocity[:3]), BOUND.contact_lever * np.linalg.norm(velocity[3:])
+        lever = BOUND.contact_lever * INERTIA.mass / INERTIA.moment
+        shares = np.ones(2)
+        if push @ velocity[:3] > 0.0:
+            limit = F - max(0.0, c * speed - damping[:3] @ velocity[:3] / speed) - c * spin
+            shares[0] = np.clip(limit / np.linalg.norm(push), 0.0, 1.0)
+        if turn @ velocity[3:] > 0.0:
+            damped = lever * damping[3:] @ velocity[3:] / np.linalg.norm(velocity[3:])
+            limit = F - 0.5 * shares[0] * np.linalg.norm(push) - c * speed - max(0.0, c * spin - damped)
+            shares[1] = np.clip(limit / (lever * np.linalg.norm(turn)), 0.0, 1.0)
+        expected = spring * np.repeat(shares, 3)
+        np.testing.assert_allclose(slow_down(spring, damping, velocity, INERTIA, BOUND), expected, rtol=1e-12)
+        reduced.append((shares > 0.0) & (shares < 1.0))
+    assert np.sum(reduced, axis=0).min() > 40
+
+
 def test_tool_can_be_turned_while_it_presses_with_all_its_force():
     velocity = np.array([0.0, 0.0, -1e-4, 0.0, 0.0, 0.1])  # a bayonet that is drawn in while it turns
     pressing = bounded_wrench(np.r_[6.0, 6.0, -15.0, 0.0, 0.0, 3.0], np.zeros(6), velocity, INERTIA, BOUND)
@@ -201,12 +232,28 @@ def test_pose_order_reverses_the_limits_of_the_torque():
     np.testing.assert_array_equal(bound.in_pose_order.axes, [1.0, 2.0, 3.0, 6.0, 5.0, 4.0])
 
 
+def test_clipped_force_and_torque_do_not_depend_on_each_other():
+    np.testing.assert_allclose(
+        clip_wrench(np.r_[8.0, 6.0, 0.0, 0.3, 0.4, 0.0], AXES, 5.0, 0.25), [4.0, 3.0, 0.0, 0.15, 0.2, 0.0], rtol=1e-12
+    )
+    np.testing.assert_array_equal(clip_wrench(np.zeros(6), AXES, 0.0, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("block", [slice(0, 3), slice(3, 6)])
+def test_damper_is_scaled_to_limits_below_one(block):
+    """A norm is compared with its limit, not with its square or twice the limit."""
+    bound, damping = WrenchBound(AXES, 0.5, 0.5), np.zeros(6)
+    damping[block] = 0.6, 0.0, 0.0
+    assert damping_share(np.zeros(6), damping, bound) == pytest.approx(0.5 / 0.6, rel=1e-12)
+
+
 def test_lowered_bound_is_never_above_the_original():
     lower = BOUND.lowered_to(np.array([20.0, 5.0, np.nan, -1.0, 1.0, np.inf, 8.0, 0.5]))
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
     assert (lower.contact_stiffness, lower.contact_lever) == (BOUND.contact_stiffness, BOUND.contact_lever)
     np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
     assert BOUND.numbers.shape == (8,)
+    assert not lower.axes.flags.writeable  # it is cached
 
 
 @pytest.mark.parametrize(("force", "torque"), [(12.0, 1.5), (12.0, np.inf), (np.inf, 1.5), (np.inf, np.inf)])
@@ -218,6 +265,11 @@ def test_norm_limits_bound_every_wrench_within_the_axes(force, torque):
     if np.isfinite(force):
         np.testing.assert_allclose(bound[:3], [0.45 * force, 0.45 * force, 0.75 * force])
     assert norm_limits(force=force)[7] == np.inf
+    np.testing.assert_allclose(
+        norm_limits(0.3, 0.9).reshape(8)[3:], [0.27**0.5] * 3 + [0.3 * 0.9675**0.5, 0.9], rtol=1e-12
+    )
+    with pytest.raises(InputError, match="must be positive"):
+        norm_limits(force, 0.0)
     with pytest.raises(InputError, match="must be positive"):
         norm_limits(0.0, torque)
     with pytest.raises(InputError, match="must be positive"):
