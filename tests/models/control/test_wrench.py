@@ -252,6 +252,7 @@ def test_lowered_bound_is_never_above_the_original():
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
     assert (lower.contact_stiffness, lower.contact_lever) == (BOUND.contact_stiffness, BOUND.contact_lever)
     np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
+    np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, 2)).numbers, np.full(8, 2.0))  # whole numbers
     assert BOUND.numbers.shape == (8,)
     assert not lower.axes.flags.writeable  # it is cached
 
