@@ -277,6 +277,17 @@ def test_norm_limits_bound_every_wrench_within_the_axes(force, torque):
         norm_limits(force, np.nan)
 
 
+@pytest.mark.parametrize(("excess", "share"), [(0.5, 1.0), (1.0005, 1.0 / 1.0005), (4.0, 0.25)])
+def test_bound_approaches_on_a_straight_line(excess, share):
+    bound, change = np.arange(1.0, 9.0), np.array([2.0, -0.5, 0.0, 0.1, 1.0, -3.0, 0.2, 4.0])
+    max_change = 10.0 * np.abs(change) + 1.0
+    max_change[1] = 0.5 / excess  # the number that changes fastest
+    target = bound + change
+    moved = approach_bound(bound, target, max_change)
+    np.testing.assert_allclose(moved, bound + share * change, rtol=1e-12)
+    assert moved is not target
+
+
 @pytest.mark.parametrize("value", [np.inf, np.nan])
 def test_approach_refuses_bounds_that_are_not_finite(value):
     finite, infinite = np.ones(8), np.r_[np.ones(7), value]
