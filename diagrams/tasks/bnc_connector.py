@@ -123,8 +123,8 @@ contact is. The demonstrations' covariance in x and y, and so the displacement p
 search; otherwise a constant action would sweep the plug across the rim.
 """
 
-# Size of the task board [m], its distance below the jack [m], and its color. The board has no collision geometry,
-# because the locked plug's mouth reaches slightly below the jack's bottom.
+# Size of the task board [m], its distance below the jack [m], and its color. It is visual only: the board that the plug
+# touches belongs to the jack and is lower, because the locked plug's mouth reaches slightly below the jack's bottom.
 BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]
 LOCKED_HEIGHT = 0.6e-3  # [m] largest deviation of a locked plug along the jack's axis
 LOCKED_ANGLE = np.deg2rad(4.0)  # [rad] largest deviation of a locked plug about the jack's axis
@@ -168,7 +168,7 @@ class BncWorkcell(MovableWorkcell):
         return folder_of(self.dimensions, self.friction) / name
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Add the jack, and a board under it without collision geometry."""
+        """Add the jack, and a visual board under it."""
         super().add_fixture(plant)
         depth, width, thickness = BOARD
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])

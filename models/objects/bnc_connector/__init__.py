@@ -10,8 +10,8 @@ minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked
 Contact. The ring has open rigid surfaces: the mouth's flat face, and its chamfer with the bore, which collide only with
 the barrel, a pair of slots that collide only with the lugs, and the outer wall, for a plug that is moved into the jack
 from the side. The first three have a third of the triangles of a closed ring, and their contact is computed five times
-faster. The corner between face and chamfer is a lip, a
-shallow cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant
+faster. A board below the jack keeps a plug from coming under the barrel. The corner between face and chamfer is a lip,
+a shallow cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant
 primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their detents.
 
 `python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
@@ -269,6 +269,8 @@ LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, dissi
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # models the gasket as a soft spring
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
+BOARD = ContactMaterial(friction=FRICTION, modulus=3e8, resolution=40.0 * MM, dissipation=DISSIPATION, margin=MARGIN)
+BOARD_SIZE, BOARD_DEPTH = (80.0 * MM, 80.0 * MM, 10.0 * MM), 2.0 * MM  # size, and distance below the jack [m]
 
 PLUG_MASS = 0.03  # [kg]
 
@@ -276,7 +278,7 @@ PLUG_MASS = 0.03  # [kg]
 # plug out: the face's normal is perpendicular to the gradient of the barrel's pressure, which Drake accepts.
 TOUCHING: dict[str, tuple[str, ...]] = {
     "barrel": ("bore",), "barrel_end": ("face",), "lug_0": ("slots", "side"), "lug_1": ("slots", "side"),
-    "pad": ("seat",), "barrel_side": ("side",),
+    "pad": ("seat",), "barrel_side": ("side",), "board": ("face",),
 }  # fmt: skip
 """Surfaces of the plug that each surface of the jack can touch."""
 
@@ -290,11 +292,13 @@ def barrel_sides(dimensions: BncDimensions) -> int:
 def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """Return the jack's model: link `jack` is frame J, with the surfaces of `TOUCHING`.
 
-    `friction` applies to barrel and lugs. The collision geometry of the barrel is a polygon with the area of its
+    `friction` applies to barrel, lugs and board. The collision geometry of the barrel is a polygon with the area of its
     circle.
     """
     d = dimensions
-    side, end, lug_material = (replace(metal, friction=friction) for metal in (BARREL, BARREL_END, LUG))
+    side, end, lug_material, board = (
+        replace(material, friction=friction) for material in (BARREL, BARREL_END, LUG, BOARD)
+    )
     center = sdf.at(z=d.barrel_height / 2)
     barrel = sdf.cylinder(sdf.equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
     pad = (sdf.at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), sdf.cylinder(d.pad_radius, d.pad_thickness))
@@ -308,6 +312,7 @@ def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
         lug = (sdf.at(x=sign * lug_center, z=d.lug_height, pitch=np.pi / 2), sdf.cylinder(d.lug_radius, lug_length))
         contents += sdf.collision(f"lug_{number}", *lug, lug_material) + sdf.visual(f"lug_{number}_visual", *lug, BRASS)
     contents += sdf.collision("barrel_side", center, barrel, replace(side, margin=MARGIN))
+    contents += sdf.collision("board", sdf.at(z=-BOARD_DEPTH - BOARD_SIZE[2] / 2), sdf.box(*BOARD_SIZE), board)
     return sdf.model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 
 

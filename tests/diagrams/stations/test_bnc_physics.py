@@ -141,6 +141,14 @@ def test_plug_from_the_side_stops_at_the_jack(axis, z_mm, jack_radius):
     assert np.abs(pose[:, 2] - motion[0, 2]).max() < 0.01 * MM
 
 
+def test_plug_beside_the_jack_stops_at_the_board():
+    """Under the barrel, surfaces that are open would throw it out."""
+    motion = np.zeros((3, 6))
+    motion[:, 0], motion[:, 2] = -14.0 * MM, np.array([2.0, -6.0, -6.0]) * MM
+    pose = drive_along(GantryStation(WORKCELL), np.array([0.0, 0.5, 1.0]), motion)[1]["pose"]
+    assert pose[-1, 2] == pytest.approx(-2.0 * MM - WORKCELL.dimensions.locked_height, abs=0.02 * MM)
+
+
 def test_lugs_do_not_tunnel_at_the_effort_limit():
     recording = drive([0, 1.0, 2.5, 3.5], [CLEAR / MM, 3.0, 3.0, 3.0], [90, 90, -90, -90])
     assert recording["saturation"][-1, 0] == 1.0
