@@ -170,7 +170,8 @@ def test_shares_of_a_moving_tool_are_those_of_the_two_inequalities():
     rng, reduced = np.random.default_rng(6), []
     for _ in range(400):
         spring, velocity = rng.normal(size=6) * np.repeat([8.0, 0.5], 3), rng.normal(size=6) * np.repeat([0.01, 0.5], 3)
-        damping, push, turn = 200.0 * rng.random(6) * np.repeat([1.0, 1e-3], 3) * velocity, spring[:3], spring[3:]
+        D, push, turn = 10.0 ** rng.uniform(0.0, 4.0) * np.repeat([1.0, 1e-3], 3), spring[:3], spring[3:]
+        damping = D * velocity
         c, F = 2.0 * np.sqrt(BOUND.contact_stiffness * INERTIA.mass), BOUND.force
         speed, spin = np.linalg.norm(velocity[:3]), BOUND.contact_lever * np.linalg.norm(velocity[3:])
         lever = BOUND.contact_lever * INERTIA.mass / INERTIA.moment
