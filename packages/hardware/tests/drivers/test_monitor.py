@@ -346,6 +346,7 @@ def test_monitor_sends_heartbeats_before_the_first_status(arm):
     bus = Bus(arm)
     bus.advance(1, status=False)
     assert (len(bus.heartbeats), bus.monitor.fault, bus.commands) == (1, Fault.NO_STATUS, [])
+    assert HEARTBEAT_FORMAT.unpack(bus.heartbeats[0])[3] == -1  # no command yet
 
 
 def test_monitor_checks_once_per_period_without_statuses(arm):
@@ -454,6 +455,7 @@ def test_monitor_calls_hold_after_a_status_fault(arm):
     bus.start_watching()
     bus.advance(2, joint_velocity_estimated=[np.nan] * 7)
     np.testing.assert_array_equal(bus.commands, np.zeros((1, 7)))  # before the driver holds the arm
+    np.testing.assert_array_equal(bus.monitor._command, np.zeros(7))  # with which the velocity is predicted
     bus.advance(1, command=True, joint_velocity_estimated=[np.nan] * 7)
     assert (len(holds), bus.monitor.state) == (3, MonitorState.DAMPING)
     bus.advance(100)
