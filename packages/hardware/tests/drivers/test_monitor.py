@@ -486,6 +486,24 @@ def test_arm_is_damped_when_hold_has_no_effect(arm):
     assert bus.speed < 0.15 < initial_speed
 
 
+def test_every_stop_begins_with_its_speed_and_another_hold(arm):
+    class HoldingDriver(IiwaDriver):
+        can_hold = True
+
+        def hold(self):
+            return True
+
+    velocity = np.linspace(0.1, -0.4, 7)
+    bus = Bus(arm, velocity=velocity)
+    bus.monitor = SafetyMonitor(HoldingDriver(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
+    bus.start_watching()
+    bus.monitor._can_hold = False  # as after a stop in which the driver did not hold the arm
+    velocity = bus.velocities.copy()
+    bus.advance(1, status=b"noise")
+    assert bus.monitor._can_hold
+    assert bus.monitor._initial_speed == pytest.approx(np.abs(velocity).max(), rel=0.1)
+
+
 def test_second_robot_is_not_adopted_while_the_commander_pauses(arm):
     """Damping its velocity would accelerate the arm at rest."""
     bus = Bus(arm, velocity=np.zeros(7))
