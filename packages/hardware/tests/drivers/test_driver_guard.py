@@ -381,3 +381,8 @@ def test_forget_errors_clears_failure_and_recovery():
         guard.receive()
         assert guard.read() is not MALFORMED_STATUS
     assert (guard.take_failure(), guard.take_recovery()) == (False, False)
+    assert (guard.has_torque, guard.take_refusal()) == (True, False)
+    driver.hold = lambda: False
+    assert (guard.hold(), guard.has_torque) == (False, False)
+    guard.forget_errors()
+    assert (guard.has_torque, guard.take_refusal()) == (True, False)
