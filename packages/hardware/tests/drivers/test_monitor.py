@@ -493,15 +493,15 @@ def test_every_stop_begins_with_its_speed_and_another_hold(arm):
         def hold(self):
             return True
 
-    velocity = np.linspace(0.1, -0.4, 7)
-    bus = Bus(arm, velocity=velocity)
+    bus = Bus(arm, velocity=np.linspace(-0.4, 0.1, 7))
     bus.monitor = SafetyMonitor(HoldingDriver(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
     bus.start_watching()
     bus.monitor._can_hold = False  # as after a stop in which the driver did not hold the arm
     velocity = bus.velocities.copy()
+    assert -velocity.min() > velocity.max()
     bus.advance(1, status=b"noise")
     assert bus.monitor._can_hold
-    assert bus.monitor._initial_speed == pytest.approx(np.abs(velocity).max(), rel=0.1)
+    assert bus.monitor._initial_speed == pytest.approx(-velocity.min(), rel=0.1)
 
 
 def test_second_robot_is_not_adopted_while_the_commander_pauses(arm):
