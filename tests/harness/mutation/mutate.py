@@ -315,17 +315,21 @@ def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[
     """
     mutated, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
     lines = covered["lines"].get(mutant.file, {})
-    chosen = {test for test in seconds if any(line in mutated for line in lines.get(test, ()))}
+    executing = {test for test in seconds if any(line in mutated for line in lines.get(test, ()))}
     # Only the first test executes a shared fixture, and no test executes constants and defaults. Therefore all tests of
-    # the test file with the same name are added.
+    # the test file with the same name are added, after those that execute the line.
     own = {f"test_{Path(mutant.file).stem}", *(Path(name).stem for name in TARGETS[mutant.file])}
-    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem in own}
-    chosen = sorted(chosen or seconds, key=lambda test: (seconds[test] + 1e-3) / (1.0 + kills[test]))
+    chosen = executing | {test for test in seconds if Path(test.split("::")[0]).stem in own}
+    chosen = sorted(
+        chosen or seconds, key=lambda test: (test not in executing, (seconds[test] + 1e-3) / (1.0 + kills[test]))
+    )
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
     failed = _first_failure(mutant.file, mutant.tree(), chosen, items, limit)
     if failed < 0:
         return ""
-    sequence = tuple(chosen[: failed + 1])
+    # The killing test alone is enough if it fails alone, too, so that most sequences need not pass again.
+    alone = _first_failure(mutant.file, mutant.tree(), chosen[failed : failed + 1], items, limit) >= 0
+    sequence = tuple(chosen[failed : failed + 1] if alone else chosen[: failed + 1])
     if sequence not in passing:
         unchanged = ast.parse((ROOT / mutant.file).read_text())
         if _first_failure(mutant.file, unchanged, sequence, items, limit) >= 0:

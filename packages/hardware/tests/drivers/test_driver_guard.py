@@ -177,6 +177,28 @@ def test_round_trip_is_measured_when_a_heartbeat_reports_the_command():
     assert guard.measure_round_trip((Heartbeat(2, False, command=1_000_000),), 0.015) == pytest.approx(0.015)
 
 
+def test_round_trip_counts_periods_without_a_clock():
+    guard = DirectDriver().guard
+    guard.write(np.zeros(7), 1.0)
+    guard.measure_round_trip((Heartbeat(1, False),), None)
+    assert guard.measure_round_trip((Heartbeat(2, False, command=1_000_000),), None) == pytest.approx(2 * PERIOD)
+
+
+def test_round_trip_does_not_grow_while_the_monitor_is_silent():
+    guard, heartbeats = DirectDriver().guard, (Heartbeat(2, False, command=1_000_000),)
+    guard.write(np.zeros(7), 1.0)
+    guard.measure_round_trip(heartbeats, 0.01)
+    guard.write(np.zeros(7), 1.005)
+    assert {guard.measure_round_trip(heartbeats, time) for time in (0.02, 0.03, 0.04, 0.05, 0.06)} == {0.01}
+
+
+def test_arrival_of_a_failed_command_is_not_awaited():
+    driver = DirectDriver()
+    driver.write = unplugged
+    assert not driver.guard.write(np.zeros(7), 1.0)
+    assert np.isnan(driver.guard.measure_round_trip((Heartbeat(2, False, command=1_000_000),), 0.01))
+
+
 @pytest.mark.parametrize(
     ("fail", "failures", "is_repeating"),
     [
@@ -262,6 +284,13 @@ def test_zero_torque_is_sent_once_after_each_torque_before_a_hold():
     np.testing.assert_array_equal(torques, np.outer([2.0, 0.0, 3.0, 0.0], np.ones(7)))
 
 
+def test_refusal_to_hold_is_reported_once():
+    driver = HoldingDriver()
+    driver.hold = lambda: False
+    driver.guard.hold()
+    assert [driver.guard.take_refusal(), driver.guard.take_refusal()] == [True, False]
+
+
 @pytest.mark.parametrize("answer", [True, None])
 def test_arm_is_damped_when_hold_has_no_effect(answer):
     arm = MovingArm(HoldingDriver)
@@ -325,6 +354,25 @@ def test_wall_clock_steps_when_receiving_raises():
     assert len(calls) < 20  # `receive` is not called in a busy loop
 
 
+@pytest.mark.parametrize(("arguments", "timeout", "wait"), [((), 0.0, 0.0), ((1.0,), 1.0, PERIOD)])
+def test_receive_waits_for_at_most_a_period_when_it_raises(monkeypatch, arguments, timeout, wait):
+    driver, timeouts, waits = DirectDriver(), [], []
+    monkeypatch.setattr("time.sleep", waits.append)
+    driver.receive = lambda timeout: timeouts.append(timeout) or unplugged()
+    driver.guard.receive(*arguments)
+    assert (timeouts, waits) == ([timeout], [wait])
+
+
+def test_describe_stop_names_an_exception_after_a_valid_status():
+    """The fault of a single failure remains while later statuses are valid."""
+    driver = NoisyDriver()
+    driver.receive = unplugged
+    driver.guard.receive()
+    assert driver.guard.read() is MALFORMED_STATUS
+    assert driver.guard.read() is not MALFORMED_STATUS
+    assert describe_stop(Fault.MALFORMED, driver).endswith("(receive raised OSError: cable unplugged)")
+
+
 def test_describe_stop_names_an_exception_of_error():
     class DriverWithoutError(DirectDriver):
         error = property(unplugged)
@@ -354,6 +402,27 @@ def test_recover_raises_one_error_for_any_exception():
     driver.recover = refuse
     with pytest.raises(InputError, match="the error persists"):
         driver.guard.recover()
+
+
+def test_recover_forgets_errors():
+    driver = DirectDriver()
+    driver.receive = unplugged
+    driver.guard.receive()
+    with pytest.raises(InputError, match="no status can be read"):
+        driver.guard.check_readable()
+    driver.recover = lambda: None
+    driver.guard.recover()
+    driver.guard.check_readable()
+
+
+def test_heartbeat_is_sent_and_its_exception_is_a_failure():
+    driver, heartbeats = DirectDriver(), []
+    driver.write_heartbeat = heartbeats.append
+    driver.guard.write_heartbeat(Heartbeat(1, False))
+    assert (heartbeats, driver.guard.take_failure()) == ([Heartbeat(1, False)], False)
+    driver.write_heartbeat = unplugged
+    driver.guard.write_heartbeat(Heartbeat(2, False))
+    assert driver.guard.take_failure()
 
 
 @pytest.mark.parametrize("method", ["configure", "write_pose", "stop"])
