@@ -52,6 +52,13 @@ def test_samples_before_the_time_constant_decay():
     assert simulate([old] * 10 + [new] * 10)[0] == pytest.approx(0.0)
 
 
+def test_sample_counts_from_the_smallest_force_on():
+    mean = ContactPointMean(0.5, 10.0)
+    for force in (np.nextafter(0.5, 0.0), 0.5):
+        mean.add(np.zeros(6), wrench_at([0.001, 0.0], force=force))
+    assert mean.count == 1.0
+
+
 @pytest.mark.parametrize("place", range(6))
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_samples_that_are_not_finite_are_skipped(place, value):

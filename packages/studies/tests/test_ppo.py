@@ -34,6 +34,42 @@ def test_settings_reach_the_algorithm():
         resolve_preset("tqc_fast", "ppo")
 
 
+def run_episode(learner, cost, length=4):
+    learner.on_episode_start()
+    for step in range(length):
+        is_last, action = step == length - 1, learner.act(OBSERVATION)
+        learner.on_step(Transition(OBSERVATION, action, 2.0, OBSERVATION, is_last, False, {"cost": cost}))
+    learner.on_episode_end({"success": 0})
+
+
+def test_multiplier_follows_the_cost_of_episodes_above_the_limit():
+    """By hand: the first training knows one episode, with a cost of 4, the second one two, with a mean of 2."""
+    config = make_config("ppo", {"n_steps": 8, "net_arch": "4", "cost_limit": 1.0, "multiplier_rate": 0.5})
+    learner = make_learner(config)
+    for cost in (1.0, 0.0):
+        run_episode(learner, cost)
+    assert learner.multiplier == pytest.approx(0.5 * (4.0 - 1.0))
+    run_episode(learner, 1.0)
+    np.testing.assert_allclose(learner.model.rollout_buffer.rewards[:4, 0], (2.0 - 1.5 * 1.0) / (1.0 + 1.5))
+    restored = make_learner(config)
+    restored.restore(*learner.state())
+    for each in (learner, restored):
+        run_episode(each, 0.0)
+        assert each.multiplier == pytest.approx(1.5 + 0.5 * ((0.0 + 4.0) / 2 - 1.0))
+        assert each.metrics()["train/multiplier"] == each.multiplier
+        for _ in range(10):
+            run_episode(each, 0.0)
+        assert each.multiplier == 0.0  # not negative
+
+
+def test_cost_limit_needs_a_cost():
+    learner = make_learner(make_config("ppo", {"cost_limit": 0.0}))
+    learner.on_episode_start()
+    transition = Transition(OBSERVATION, learner.act(OBSERVATION), 2.0, OBSERVATION, False, False, {})
+    with pytest.raises(InputError, match="info has no cost"):
+        learner.on_step(transition)
+
+
 def test_learner_bootstraps_a_time_limit():
     """By hand: with γ = 1, the stored reward of a truncated step is its reward plus the next state's value."""
     learner = make_learner(make_config("ppo", {"n_steps": 8, "gamma": 1.0, "net_arch": "4"}))

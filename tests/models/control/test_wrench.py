@@ -1,6 +1,7 @@
 """Bounded wrench of an impedance law: inside its bound for any input, passive, with a limited approach speed."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from guiderail.models.control.wrench import (
     approach_bound,
     approach_impedance,
     bounded_wrench,
+    check_spring_damper,
     clip_wrench,
     damping_share,
     governed_error,
@@ -240,6 +242,32 @@ def test_clipped_force_and_torque_do_not_depend_on_each_other():
     np.testing.assert_array_equal(clip_wrench(np.zeros(6), AXES, 0.0, 0.0), 0.0)
 
 
+def test_damping_share_ignores_axes_without_damping():
+    """An axis may have neither damping nor a limit above zero; numbers of freed memory do not count."""
+    bound, damping = WrenchBound(np.r_[0.5, np.zeros(5)], np.inf, np.inf), np.r_[1.0, np.zeros(5)]
+    for _ in range(20):
+        freed = [np.full(6, -1.0) for _ in range(50)]
+        del freed
+        assert damping_share(np.zeros(6), damping, bound) == 0.5
+
+
+def test_governed_error_leaves_room_for_the_force_of_moving():
+    """Force and torque have limits of their own, each reduced by (K h + D) |v| of its coordinates."""
+    bound, step = WrenchBound(np.full(6, 100.0), 10.0, 2.0), 0.005
+    stiffness, damping = np.r_[np.full(3, 800.0), np.full(3, 30.0)], np.r_[np.full(3, 50.0), np.full(3, 1.5)]
+    velocity = np.array([0.03, 0.0, 0.04, 0.0, 0.3, 0.4])
+    error = governed_error(stiffness, damping, np.array([0, 0.1, 0, 0.5, 0, 0]), velocity, INERTIA, step, bound)
+    expected = [10.0 - (800.0 * step + 50.0) * 0.05, 2.0 - (30.0 * step + 1.5) * 0.5]
+    np.testing.assert_allclose((stiffness * error)[[1, 3]], expected, rtol=1e-12)
+
+
+def test_governed_error_is_zero_while_moving_takes_the_whole_bound():
+    bound, velocity = WrenchBound(np.full(6, 100.0), 1.5, 0.5), np.array([0.03, 0.0, 0.04, 0.0, 0.3, 0.4])
+    stiffness, damping = np.r_[np.full(3, 800.0), np.full(3, 30.0)], np.r_[np.full(3, 50.0), np.full(3, 1.5)]
+    error = governed_error(stiffness, damping, np.array([0, 0.1, 0, 0.5, 0, 0]), velocity, INERTIA, 0.005, bound)
+    np.testing.assert_array_equal(error, 0.0)
+
+
 @pytest.mark.parametrize("block", [slice(0, 3), slice(3, 6)])
 def test_damper_is_scaled_to_limits_below_one(block):
     """A norm is compared with its limit, not with its square or twice the limit."""
@@ -341,6 +369,32 @@ def test_force_is_the_gradient_of_the_energy():
             for d in step
         ]
         np.testing.assert_allclose(gradient, np.clip(STIFFNESS * error, -SPRING_LIMITS, SPRING_LIMITS), atol=1e-5)
+
+
+def test_energy_of_springs_has_its_closed_form():
+    energy = 0.5 * 1500.0 * 0.004**2 + (3.0 * 0.2 - 3.0**2 / (2 * 30.0))
+    assert spring_energy(STIFFNESS, SPRING_LIMITS, np.array([0.004, -0.2])) == pytest.approx(energy, rel=1e-12)
+    assert spring_energy(STIFFNESS, SPRING_LIMITS, np.zeros(2)) == 0.0
+
+
+def test_share_of_a_change_has_its_closed_form():
+    """The energy of one spring without a limit, ½ K (s e)², is the largest one at s = √(2 E / K) / e."""
+    stiffness, limits, errors = np.array([200.0]), (np.array([1e9]),) * 2, (np.zeros(1), np.ones(1))
+    for energy in (100.0, 100.0 * (1.0 - 5e-4), 30.0, 1e-3):
+        share, stored = admissible_change(stiffness, limits, errors, energy)
+        assert 0.0 <= math.sqrt(energy / 100.0) - share < 2.0**-39
+        assert stored <= energy
+    assert admissible_change(stiffness, limits, errors, 100.0) == (1.0, 100.0)
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping"])
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_spring_and_damper_are_refused_when_a_single_number_is_wrong(name, value):
+    K, D = np.ones(6), np.zeros(6)
+    np.testing.assert_array_equal(check_spring_damper(K, D, "the robot"), (K, D))  # no damping is allowed
+    (K if name == "stiffness" else D)[4] = value
+    with pytest.raises(InputError, match="the robot needs six positive stiffnesses and six dampings"):
+        check_spring_damper(K, D, "the robot")
 
 
 def test_change_stores_no_more_than_the_available_energy():

@@ -52,7 +52,7 @@ class ProMp:
         count = min(NUM_BASIS, max(steps // 4, 2)) if num_basis is None else num_basis
         count = as_whole(count, "num_basis", 2, max(steps // 2, 2))
         clock = demonstrations.times[0]
-        features = _features((clock - clock[0]) / (clock[-1] - clock[0]), count)
+        features = basis((clock - clock[0]) / (clock[-1] - clock[0]), count)
         outputs = np.stack(demonstrations.outputs)
         gram = features.T @ features
         gram += RIDGE * np.linalg.eigvalsh(gram)[-1] * np.eye(count)
@@ -117,7 +117,7 @@ class ProMp:
     def _blocks(self, phases: np.ndarray) -> np.ndarray:
         """Return I ⊗ φ(s)ᵀ at phases (n,), (n, O, O·K)."""
         count = len(self.mean) // self.num_outputs
-        features = _features(phases, count)
+        features = basis(phases, count)
         blocks = np.einsum("op,nk->nopk", np.eye(self.num_outputs), features)
         return blocks.reshape(len(features), self.num_outputs, -1)
 
@@ -153,8 +153,8 @@ def blend(first: ReferenceTrajectory, second: ReferenceTrajectory, share: float 
     return ReferenceTrajectory(first.times, means, (covariances + covariances.transpose(0, 2, 1)) / 2)
 
 
-def _features(phases: np.ndarray, count: int) -> np.ndarray:
-    """Return normalized Gaussian basis functions (n, K) at phases (n,); their spacing is one standard deviation."""
+def basis(phases: np.ndarray, count: int) -> np.ndarray:
+    """Return K normalized Gaussian basis functions (n, K) at phases (n,); their spacing is one standard deviation."""
     offsets = (np.asarray(phases, dtype=float)[:, None] - np.linspace(0.0, 1.0, count)) * (count - 1)
     bumps = np.exp(-0.5 * offsets**2)
     return bumps / bumps.sum(axis=1, keepdims=True)

@@ -89,7 +89,18 @@ def test_thresholds_have_their_documented_values():
     assert (module.MAX_EQUAL_POSITIONS, module.MAX_EQUAL_VELOCITIES, module.MAX_EQUAL_STATUSES) == (2, 4, 4)
     assert (module.MODEL_ERROR, module.SENSOR_ERROR, module.EXTERNAL_STEP) == (0.3, 0.1, 2.0)
     assert (module.LAG, module.MAX_ACCELERATION, module.DELAY, module.REACTION) == (1.0, 10.0, 2.0, 1.5)
+    assert (module.DRIFT_WINDOW, module.MAX_DRIFT) == (2.0, 5.0)
+    assert (module.SCALE_WINDOW, module.MAX_EXCESS) == (0.1, 0.35)
+    assert (module.PULSE_WINDOW, module.MAX_SCALE_ERROR) == (0.02, 0.35)
+    assert (module.SOURCE_TIME, module.SOURCE_SPEED, module.SOURCE_DISTANCE) == (1.0, 0.05, 0.1)
     assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME, module.REST_SPEED) == (6.0, 1.0, 0.05, 0.05)
+
+
+@pytest.mark.parametrize(("age", "speed"), [(0.0, 0.5), (2.999, 0.5), (3.001, np.nan)])
+def test_reported_speed_is_known_for_three_periods(age, speed):
+    state = module.EstimatorState.initial(2)
+    state = state._replace(check_time=1.0, receipt_time=1.0 - 0.01 * age, last_values=np.array([1, 1, -0.5, 0.2, 9, 9]))
+    np.testing.assert_equal(state.reported_speed(0.01), speed)
 
 
 def test_valid_status_is_accepted_at_once():

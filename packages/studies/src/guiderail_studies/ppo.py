@@ -14,6 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from torch.nn.utils import parameters_to_vector
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import module_arrays, random_state, restore_modules, restore_random
@@ -29,9 +30,15 @@ _BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "value
 class PpoLearner(Learner):
     """Learner of proximal policy optimization (PPO; Schulman et al., 2017).
 
+    With a `cost_limit`, the reward r of an action with the cost c, `info["cost"]`, becomes (r − λ c) / (1 + λ). Before
+    each training, the Lagrange multiplier λ ≥ 0 changes by `multiplier_rate` times the difference of the mean cost of
+    the episodes since the last training and the limit. This is PPO-Lagrangian (Ray, Achiam and Amodei, 2019) with one
+    critic of the penalized reward, as in reward constrained policy optimization (Tessler, Mankowitz and Mannor, 2019).
+
     Attributes:
         model: PPO of Stable-Baselines3.
         transitions: Number of transitions so far.
+        multiplier: Lagrange multiplier of the cost.
     """
 
     Config = PpoConfig
@@ -54,13 +61,19 @@ class PpoLearner(Learner):
         )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.model.policy.set_training_mode(False)
-        self.transitions = 0
+        self.transitions, self.multiplier = 0, 0.0
         self._is_start = True
+        self._cost, self._ended_costs = 0.0, list[float]()  # of this episode, and of those since the last training
         self._sampled: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # action, value, log. probability
 
     def on_episode_start(self) -> None:
         """Start an episode, so that no advantage is estimated across its start."""
-        self._is_start = True
+        self._is_start, self._cost = True, 0.0
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """End an episode, whose cost counts for the multiplier."""
+        self._ended_costs.append(self._cost)
+        return {}
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return a sampled action (A,) for an observation (n,), clipped to the action space."""
@@ -82,7 +95,7 @@ class PpoLearner(Learner):
             self._is_start, self._sampled = True, None
             return
         action, value, log_prob = self._sampled
-        reward = transition.reward
+        reward = self._penalized(transition)
         if transition.truncated and not transition.terminated:  # bootstrap, because the task did not end
             reward += self.model.gamma * float(self._value(transition.next_observation))
         starts = np.array([self._is_start])
@@ -92,11 +105,27 @@ class PpoLearner(Learner):
         if buffer.full:
             last_value = self._value(transition.next_observation)
             buffer.compute_returns_and_advantage(last_value, np.array([transition.is_last]))
+            self._update_multiplier()
             self.model.train()
             self.model.policy.set_training_mode(False)
             buffer.reset()
             if self.has_diverged():
                 raise divergence_error()
+
+    def _penalized(self, transition: Transition) -> float:
+        if self.config.cost_limit is None:
+            return transition.reward
+        if "cost" not in transition.info:
+            raise InputError("the environment's info has no cost: leave --set cost_limit out, or add the cost")
+        cost = float(transition.info["cost"])
+        self._cost += cost
+        return (transition.reward - self.multiplier * cost) / (1.0 + self.multiplier)
+
+    def _update_multiplier(self) -> None:
+        if self.config.cost_limit is not None and self._ended_costs:
+            excess = float(np.mean(self._ended_costs)) - self.config.cost_limit
+            self.multiplier = max(0.0, self.multiplier + self.config.multiplier_rate * excess)
+        self._ended_costs = []
 
     def _value(self, observation: np.ndarray) -> torch.Tensor:
         policy = self.model.policy
@@ -107,7 +136,7 @@ class PpoLearner(Learner):
         """Return the values that the last training recorded in the logger of Stable-Baselines3."""
         recorded = dict(self.model.logger.name_to_value)
         self.model.logger.dump()
-        return recorded
+        return recorded if self.config.cost_limit is None else recorded | {"train/multiplier": self.multiplier}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """Return the policy of the most probable action; the entries of `description` are added to its description."""
@@ -126,6 +155,8 @@ class PpoLearner(Learner):
         arrays |= {f"buffer/{name}": getattr(buffer, name)[: buffer.pos] for name in _BUFFER_ARRAYS if buffer.pos}
         generators, states = random_state()
         values = {"transitions": self.transitions, "updates": self.model._n_updates, "buffer": buffer.pos}
+        if self.config.cost_limit is not None:
+            values |= {"multiplier": self.multiplier, "costs": self._ended_costs}
         return arrays | generators, values | states
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
@@ -138,4 +169,6 @@ class PpoLearner(Learner):
         for name in _BUFFER_ARRAYS if buffer.pos else ():
             getattr(buffer, name)[: buffer.pos] = arrays[f"buffer/{name}"]
         self.transitions, self.model._n_updates = values["transitions"], values["updates"]
+        if self.config.cost_limit is not None:
+            self.multiplier, self._ended_costs = values["multiplier"], list(values["costs"])
         restore_random(arrays, values)

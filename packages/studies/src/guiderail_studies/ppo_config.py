@@ -26,3 +26,5 @@ class PpoConfig(LearnerConfig):
     net_arch: NetArch = (64, 64)  # units of the hidden layers
     n_epochs: Positive = 10  # passes through the transitions of a training
     ent_coef: Fraction = 0.0  # weight of the entropy in the loss
+    cost_limit: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None  # mean cost of an episode; None: any
+    multiplier_rate: Rate = 0.035  # learning rate of the cost's Lagrange multiplier, as in OmniSafe

@@ -52,10 +52,8 @@ REACTION = 1.5  # accepted change of velocity that no torque explains, relative 
 MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
 BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time constants of the learned bias with and without commanded torque [s]
 REST_SPEED = 0.05  # speed up to which the bias is learned without commanded torque [rad/s]
-SCALE_WINDOW, MAX_EXCESS = (
-    0.1,
-    0.35,
-)  # decay time and largest share of statuses with a larger impulse than commanded [s]
+# Decay time [s] and largest share of statuses with a larger impulse than commanded
+SCALE_WINDOW, MAX_EXCESS = 0.1, 0.35
 PULSE_WINDOW = 0.02  # decay time of the largest commanded impulse, longer than the delay of its effect [s]
 MAX_SCALE_ERROR = 0.35  # largest relative error of a torque in effect
 # Signs of another robot or clock on the channel, besides a velocity that does not react. Afterwards a status is only
