@@ -190,3 +190,9 @@ def test_age_is_relative_to_the_start_before_the_first_check(age, command_timed_
     rig.command(FIRST, time=start - age)
     rig.simulator.Initialize()
     rig.check(START if command_timed_out else FIRST, command_timed_out)
+
+
+@pytest.mark.parametrize("timeout", [0.0, -0.1, np.nan, np.inf])
+def test_constructor_refuses_a_timeout_out_of_range(timeout):
+    with pytest.raises(InputError, match="the timeout of commands must be positive and finite"):
+        CommandWatchdog(PERIOD, timeout)

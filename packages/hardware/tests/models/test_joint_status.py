@@ -1,6 +1,7 @@
 """Checks of a status against its predecessor, on both sides of each limit."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from guiderail_hardware.models.joint_status import (
     StatusLimits,
     check_status,
     damping_torque,
+    is_hold_ineffective,
     parse_status,
 )
 
@@ -82,7 +84,11 @@ def test_counter_that_is_not_finite_is_malformed(field, value):
     assert parse_status(replace(status(), **{field: value})) is MALFORMED_STATUS
 
 
-@pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, Unreadable()], ids=str)
+@pytest.mark.parametrize(
+    "value",
+    [{"time": 1.0}, "status", 0, False, Unreadable(), SimpleNamespace(**vars(status()))],
+    ids=lambda v: repr(v)[:9],
+)
 def test_object_of_another_type_is_malformed(value):
     assert parse_status(value) is MALFORMED_STATUS
 
@@ -221,3 +227,24 @@ def test_damping_torque_multiplies_the_velocity_by_its_decay():
     M, v = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([0.3, -0.4])
     torque = damping_torque(M, v, 0.02, period=0.005)
     np.testing.assert_allclose(v + 0.005 * np.linalg.solve(M, torque), np.exp(-0.25) * v, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("speed", "initial", "elapsed", "expected"),
+    [
+        (0.25, 0.4, 0.05, True),
+        (0.25, 0.4, 0.0499, False),
+        (0.2, 0.4, 0.05, False),
+        (0.2001, 0.4, 1.0, True),
+        (0.0499, 0.06, 1.0, False),  # slow enough, although more than half of the initial speed
+        (0.0501, 0.06, 1.0, True),
+        (0.05, 0.06, 1.0, False),
+        (np.nan, 0.4, 1.0, False),
+    ],
+)
+def test_hold_is_ineffective_unless_the_speed_halves_in_time(speed, initial, elapsed, expected):
+    assert is_hold_ineffective(speed, initial, elapsed) == expected
+
+
+def test_heartbeat_knows_no_command_by_default():
+    assert Heartbeat(1, False) == Heartbeat(1, False, sender=0, command=-1)

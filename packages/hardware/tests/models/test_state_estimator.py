@@ -96,13 +96,6 @@ def test_thresholds_have_their_documented_values():
     assert (module.MAX_BIAS, module.BIAS_TIME, module.REST_BIAS_TIME, module.REST_SPEED) == (6.0, 1.0, 0.05, 0.05)
 
 
-@pytest.mark.parametrize(("age", "speed"), [(0.0, 0.5), (2.999, 0.5), (3.001, np.nan)])
-def test_reported_speed_is_known_for_three_periods(age, speed):
-    state = module.EstimatorState.initial(2)
-    state = state._replace(check_time=1.0, receipt_time=1.0 - 0.01 * age, last_values=np.array([1, 1, -0.5, 0.2, 9, 9]))
-    np.testing.assert_equal(state.reported_speed(0.01), speed)
-
-
 def test_valid_status_is_accepted_at_once():
     rig = Rig().settle()
     assert rig.check() == Fault.NONE
@@ -659,6 +652,17 @@ def test_unexplained_velocity_is_a_fault_after_the_maximum_age(speed, expected):
     assert 8 * PERIOD > LIMITS.max_age > 7 * PERIOD
 
 
+def test_status_is_held_for_exactly_the_maximum_age():
+    rig, number = Rig(limits=replace(LIMITS, max_age=8 * PERIOD)).settle(), iter(range(1, 100))
+    speed = np.array([0.105, 0.0])
+
+    def imitate(true):
+        positions = true.positions + next(number) * PERIOD * speed
+        return replace(true, positions=positions, velocities=true.velocities + speed)
+
+    assert rig.detected(imitate, 30) == (9, Fault.NOT_REACTING)
+
+
 def test_collision_is_accepted_when_its_external_torque_is_reported():
     """Without it, the prediction does not agree, and the statuses are not used."""
     rig = Rig(external=np.zeros(2)).settle()
@@ -694,6 +698,13 @@ def test_reported_speed_is_that_of_a_fresh_status(age, speed):
     for _ in range(age):
         rig.check(None)
     assert rig.estimate.state.reported_speed(PERIOD) == pytest.approx(speed, nan_ok=True, abs=1e-6)
+
+
+@pytest.mark.parametrize(("periods", "speed"), [(2.999, 0.5), (3.001, np.nan)])
+def test_reported_speed_is_known_for_three_periods(periods, speed):
+    values = np.array([1.0, 1.0, -0.5, 0.2, 9.0, 9.0])
+    state = EstimatorState.initial(2)._replace(check_time=1.0, receipt_time=1.0 - periods * PERIOD, last_values=values)
+    np.testing.assert_equal(state.reported_speed(PERIOD), speed)
 
 
 @pytest.mark.parametrize(
@@ -1163,6 +1174,29 @@ def test_bias_is_learned_without_torque_only_at_rest(velocity, is_learned):
     for sign in (1.0, -1.0, 1.0):
         rig.check(shifted(velocities=[sign * error, 0.0]), np.zeros(2))
     assert (np.abs(rig.state.bias - before).max() > 0.1) == is_learned
+
+
+@pytest.mark.parametrize(("share", "is_learned"), [(1.0, True), (1.0005, False)])
+def test_bias_is_learned_up_to_the_rest_speed(share, is_learned):
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    for _ in range(4):
+        rig.check(torque=np.zeros(2))
+    rig.state = rig.state._replace(velocity=np.array([0.0, share * module.REST_SPEED]))
+    before = rig.state.bias
+    rig.check(torque=np.zeros(2))
+    assert np.array_equal(rig.state.bias, before) != is_learned
+
+
+def test_bias_is_not_learned_in_doubt_while_a_single_torque_is_commanded():
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    for _ in range(4):
+        rig.check(torque=np.zeros(2))
+    before = rig.state.bias
+    rig.state = rig.state._replace(
+        torque=np.array([0.5, 0.0]), doubt_time=rig.now, fault=float(Fault.FUTURE), fault_time=rig.now
+    )
+    rig.check(torque=np.zeros(2))
+    np.testing.assert_array_equal(rig.state.bias, before)
 
 
 def test_initial_state_is_zero_without_statuses():
