@@ -5,8 +5,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, L
 from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.primitive import RESIDUAL, PrimitiveGuidance, primitive_config_of
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter

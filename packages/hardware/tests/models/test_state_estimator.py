@@ -652,15 +652,16 @@ def test_unexplained_velocity_is_a_fault_after_the_maximum_age(speed, expected):
     assert 8 * PERIOD > LIMITS.max_age > 7 * PERIOD
 
 
-def test_status_is_held_for_exactly_the_maximum_age():
-    rig, number = Rig(limits=replace(LIMITS, max_age=8 * PERIOD)).settle(), iter(range(1, 100))
+@pytest.mark.parametrize(("periods", "count"), [(8.0, 9), (7.995, 8)])
+def test_status_is_held_for_exactly_the_maximum_age(periods, count):
+    rig, number = Rig(limits=replace(LIMITS, max_age=periods * PERIOD)).settle(), iter(range(1, 100))
     speed = np.array([0.105, 0.0])
 
     def imitate(true):
         positions = true.positions + next(number) * PERIOD * speed
         return replace(true, positions=positions, velocities=true.velocities + speed)
 
-    assert rig.detected(imitate, 30) == (9, Fault.NOT_REACTING)
+    assert rig.detected(imitate, 30) == (count, Fault.NOT_REACTING)
 
 
 def test_collision_is_accepted_when_its_external_torque_is_reported():
