@@ -100,9 +100,9 @@ def test_field_of_wrong_shape_is_a_fault(field, value):
 
 
 def test_parsed_status_has_the_same_numbers_in_its_own_arrays():
-    original = replace(status(), conflicts=2, foreign_commands=3)
+    original = replace(status(), conflicts=2, foreign_commands=3, round_trip=0.25)
     parsed = parse_status(original)
-    assert (parsed.time, parsed.conflicts, parsed.foreign_commands) == (original.time, 2, 3)
+    assert (parsed.time, parsed.conflicts, parsed.foreign_commands, parsed.round_trip) == (original.time, 2, 3, 0.25)
     np.testing.assert_array_equal(parsed.values(), original.values())
     original.positions[0] = 7.0
     assert parsed.positions[0] == 0.5
@@ -186,6 +186,7 @@ POSITIVE = ("max_age", "max_lead", "position_jump", "velocity_jump", "position_t
         *({name: value} for name in (*POSITIVE, "max_check_interval") for value in (0.0, np.nan, np.inf)),
         *({"velocity": (1.0, value)} for value in (0.0, -1.0, np.nan, np.inf)),
         *({name: value} for name in ("settling_time", "clock_drift") for value in (-1.0, np.nan, np.inf)),
+        *({"max_round_trip": value} for value in (0.0, -1.0, np.nan)),
     ],
     ids=str,
 )
@@ -195,8 +196,8 @@ def test_limits_refuse_values_out_of_range(changes):
 
 
 def test_limits_accept_the_ends_of_their_ranges():
-    limits = StatusLimits((1e-9,), settling_time=0.0, clock_drift=0.0)
-    assert (limits.settling_time, limits.clock_drift) == (0.0, 0.0)
+    limits = StatusLimits((1e-9,), settling_time=0.0, clock_drift=0.0, max_round_trip=1e-9)
+    assert (limits.settling_time, limits.clock_drift, limits.max_round_trip) == (0.0, 0.0, 1e-9)
 
 
 def test_limits_have_their_documented_values():

@@ -1324,6 +1324,17 @@ def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
     np.testing.assert_allclose(rig.state.velocity, predicted if is_old else predicted + error, atol=2e-3)
 
 
+def test_consistent_velocity_is_believed_beyond_the_agreement():
+    """A change of torque may have an effect of any size up to its tolerance; only a contradiction is old."""
+    rig = Rig().settle()
+    for torque in (rig.balance + [30.0, 0.0], rig.balance):
+        rig.check(torque=torque)
+    error = np.array([2.4 * module.AGREEMENT, 0.0])
+    changed = shifted(positions=0.5 * PERIOD * error, velocities=error)
+    assert rig.check(changed) == Fault.NONE
+    np.testing.assert_allclose(rig.state.velocity, rig.v + 0.5 * error, atol=2e-3)
+
+
 RECORDED = {
     0: [-27271.484989789, -27137.741892022, -27203.168898345, -27335.442517311, -27298.095483367,
         -27385.832529337, -27172.839873214, -26984.167509258, -27110.134717454, -27244.659938027],
