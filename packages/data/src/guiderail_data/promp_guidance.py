@@ -51,9 +51,8 @@ class WeightedBasis(LeafSystem):
 
 
 @register_guidance(
-    "promp", needs=(("demonstrations",),), label="weights of a ProMP", color="#8c6d31", demonstrates=True,
-    displaces=True,
-)  # fmt: skip
+    "promp", needs=(("demonstrations",),), label="weights of a ProMP", color="#8c6d31", demonstrates=True
+)
 class PrompGuidance(Guidance):
     """Guidance by weights: residual RL whose action (A·K,) displaces the whole demonstrated motion.
 
