@@ -424,6 +424,18 @@ def test_frozen_values_of_a_moving_joint_are_a_fault(fields, joint, expected):
     assert rig.detected(freeze) == (expected, Fault.FROZEN)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_effect_of_torques_is_added_to_frozen_values(joint):
+    """The median of the three sources would be the frozen velocity."""
+    rig = Rig(limits=replace(LIMITS, position_tolerance=1.0)).settle()  # the check of positions reports nothing
+    status, torque = rig.status(), rig.balance + 20.0 * M[joint]
+    rig.torque = torque
+    rig.state = rig.state._replace(torque=torque)
+    assert rig.detected(lambda true: replace(status, time=true.time), torque=torque) == (2, Fault.FROZEN)
+    assert rig.v[joint] > CRUISE[joint] + 0.1
+    np.testing.assert_allclose(rig.state.velocity[joint], rig.v[joint], atol=0.03)
+
+
 def test_equal_values_of_an_arm_at_rest_are_no_fault():
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     assert rig.detected(lambda status: status, 50) is None
@@ -650,6 +662,8 @@ def test_unexplained_velocity_is_a_fault_after_the_maximum_age(speed, expected):
 
     assert rig.detected(imitate, 30) == expected
     assert 8 * PERIOD > LIMITS.max_age > 7 * PERIOD
+    if expected:  # the prediction, not the reported velocity with the effect of the torques, which decays
+        np.testing.assert_allclose(rig.state.velocity, rig.v, atol=0.01)
 
 
 @pytest.mark.parametrize(("periods", "count"), [(8.0, 9), (7.995, 8)])
