@@ -1338,6 +1338,17 @@ def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
     np.testing.assert_allclose(rig.state.velocity, predicted if is_old else predicted + error, atol=2e-3)
 
 
+@pytest.mark.parametrize(("share", "is_believed"), [(0.9995, True), (1.0005, False)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_unexplained_change_is_believed_up_to_the_agreement(joint, share, is_believed):
+    """The status is held back; the effect of the torques without a collision replaces a larger change."""
+    rig = Rig().settle()
+    error = 2.0 * share * module.AGREEMENT * np.eye(2)[joint]  # half of it is the change of the position
+    assert rig.check(shifted(positions=0.5 * PERIOD * error, velocities=error)) == Fault.NONE
+    assert not rig.estimate.is_new
+    np.testing.assert_allclose(rig.state.velocity, rig.v + 0.5 * error * is_believed, atol=2e-3)
+
+
 def test_consistent_velocity_is_believed_beyond_the_agreement():
     """A change of torque may have an effect of any size up to its tolerance; only a contradiction is old."""
     rig = Rig().settle()
