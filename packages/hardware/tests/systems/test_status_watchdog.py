@@ -115,17 +115,20 @@ def test_faulty_status_is_not_output(plant):
     np.testing.assert_array_equal(rig["estimated_state"], before)
 
 
-def test_velocity_is_predicted_from_the_torque(plant):
+@pytest.mark.parametrize("is_sent", [True, False])
+def test_velocity_is_predicted_from_the_torque(plant, is_sent):
     """The prediction uses the inertia at the accepted positions and the damping of the joints."""
     rig = Rig(plant).settle()
     rig.set(rig.status())
     rig.torque.GetMutableData().set_value([1.0, -0.5])
     rig.step += 1
     rig.simulator.AdvanceTo(rig.step * PERIOD)
+    if not is_sent:
+        rig.system.forget_torque(rig.context)
     rig.plant.SetPositionsAndVelocities(rig.plant_context, rig["estimated_state"])
     M, drag = rig.dynamics.evaluate(rig.plant_context)
     rig.port.GetMutableData().set_value(object())
-    expected = np.array([0.1, 0.2]) + PERIOD * np.linalg.solve(M, [1.0, -0.5] - drag)
+    expected = np.array([0.1, 0.2]) + PERIOD * np.linalg.solve(M, is_sent * np.array([1.0, -0.5]) - drag)
     np.testing.assert_allclose(rig["velocity"], expected, rtol=1e-6)
 
 
