@@ -183,6 +183,21 @@ def test_rounding_by_a_bound_is_no_saturation(sign, force, is_saturated):
     assert result.is_saturated == is_saturated
 
 
+@pytest.mark.parametrize(("speed", "stretch"), [(0.3, 0.01), (1e-3, 0.01), (0.0, 0.01), (0.0, 0.0)])
+def test_bound_uses_the_inertia_along_the_motion_or_at_rest_along_the_spring(speed, stretch, monkeypatch):
+    """Translation along x and rotation about y; at rest, translation along y and rotation about z."""
+    inertias = []
+    monkeypatch.setattr(module, "bounded_wrench", lambda spring, *others: inertias.append(others[2]) or spring)
+    M, turn = positive(np.random.default_rng(0), 6), Rotation.from_rotvec([0.0, 0.0, stretch])
+    eta, epsilon = quaternion(turn)
+    changed = {"K": np.diag([1500.0, 1000, 800, 40, 30, 20]), "J": np.eye(6), "M": M}
+    motion = {"v": speed * np.eye(6)[0] + speed * np.eye(6)[4], "p_error": np.array([0.0, stretch, 0.0])}
+    torques(WrenchBound(UNLIMITED, 1e9, 1e9), **arm(0, 6, eta=eta, epsilon=epsilon, **changed, **motion))
+    inverse = np.linalg.inv(M)
+    expected = [1.0 / inverse[i, i] for i in ((0, 4) if speed else (1, 5))] if speed or stretch else [1.0, 1.0]
+    np.testing.assert_allclose([inertias[0].mass, inertias[0].moment], expected, rtol=1e-4)
+
+
 def test_thresholds_have_their_documented_values():
     assert (module.LIGHT, module.HEAVY, module.LEVER) == (300.0, 3000.0, 0.25)
     np.testing.assert_array_equal(module._REGULARIZATION, 1e-9 * np.eye(6))

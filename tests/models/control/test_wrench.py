@@ -255,9 +255,9 @@ def test_governed_error_leaves_room_for_the_force_of_moving():
     """Force and torque have limits of their own, each reduced by (K h + D) |v| of its coordinates."""
     bound, step = WrenchBound(np.full(6, 100.0), 10.0, 2.0), 0.005
     stiffness, damping = np.r_[np.full(3, 800.0), np.full(3, 30.0)], np.r_[np.full(3, 50.0), np.full(3, 1.5)]
-    velocity = np.array([0.03, 0.0, 0.04, 0.0, 0.3, 0.4])
+    velocity = np.array([0.03, 0.0, 0.04, 0.4, 0.2, 0.4])
     error = governed_error(stiffness, damping, np.array([0, 0.1, 0, 0.5, 0, 0]), velocity, INERTIA, step, bound)
-    expected = [10.0 - (800.0 * step + 50.0) * 0.05, 2.0 - (30.0 * step + 1.5) * 0.5]
+    expected = [10.0 - (800.0 * step + 50.0) * 0.05, 2.0 - (30.0 * step + 1.5) * 0.6]
     np.testing.assert_allclose((stiffness * error)[[1, 3]], expected, rtol=1e-12)
 
 

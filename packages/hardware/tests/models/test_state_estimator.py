@@ -241,6 +241,35 @@ def test_velocity_is_known_after_a_jump_of_the_local_clock(jump, torque):
     assert rig.estimate.is_new
 
 
+@pytest.mark.parametrize(
+    ("passed", "is_jump"),
+    [(PERIOD, True), (0.0, False), (0.9995 * LIMITS.max_age, True), (1.0005 * LIMITS.max_age, False)],
+)
+def test_jump_of_the_local_clock_is_what_the_robots_clock_lacks(passed, is_jump):
+    """A status of the last check shows no time, and after the maximum age the robot may have restarted."""
+    rig = Rig().settle()
+    before = rig.state
+    fault = rig.check(lambda true: replace(true, time=before.last_time + passed), gap=PERIOD + 2.0)
+    jump = rig.now - before.receipt_time - passed
+    assert (fault != Fault.STALE) == is_jump
+    assert not is_jump or rig.state.last_offset == pytest.approx(before.last_offset + jump, abs=1e-4)
+
+
+def test_late_message_is_no_jump_of_the_local_clock():
+    rig = Rig().settle()
+    late = rig.state.last_time + PERIOD
+    for _ in range(10):
+        rig.check(None)
+    assert rig.check(lambda true: replace(true, time=late)) == Fault.STALE
+
+
+def test_torque_that_was_not_sent_is_unknown():
+    rig = Rig().settle()
+    state = rig.estimator.forget_torque(rig.state)
+    np.testing.assert_array_equal(state.torque, 0.0)
+    np.testing.assert_array_equal(state.tolerance, PERIOD * np.array(TOLERANCE))
+
+
 @pytest.mark.parametrize("jump", [-2.0, -0.5, -0.05])
 def test_velocity_is_known_after_the_local_clock_is_set_back(jump):
     rig = Rig().settle()
