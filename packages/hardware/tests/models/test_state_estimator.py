@@ -242,15 +242,23 @@ def test_velocity_is_known_after_a_jump_of_the_local_clock(jump, torque):
 
 
 @pytest.mark.parametrize(
-    ("passed", "is_jump"),
-    [(PERIOD, True), (0.0, False), (0.9995 * LIMITS.max_age, True), (1.0005 * LIMITS.max_age, False)],
+    ("passed", "late", "is_jump"),
+    [
+        (1.0, 2.0, True),
+        (0.0, 2.0, False),
+        (8.0, 2.0, True),
+        (8.0 * 0.9995, 2.0, True),
+        (8.0 * 1.0005, 2.0, False),
+        (1.0, 0.5, False),
+        (1.0, 0.50025, True),
+    ],
 )
-def test_jump_of_the_local_clock_is_what_the_robots_clock_lacks(passed, is_jump):
+def test_jump_of_the_local_clock_is_what_the_robots_clock_lacks(passed, late, is_jump):
     """A status of the last check shows no time, and after the maximum age the robot may have restarted."""
-    rig = Rig().settle()
+    rig = Rig(limits=replace(LIMITS, max_age=8 * PERIOD, max_check_interval=0.5)).settle()
     before = rig.state
-    fault = rig.check(lambda true: replace(true, time=before.last_time + passed), gap=PERIOD + 2.0)
-    jump = rig.now - before.receipt_time - passed
+    fault = rig.check(lambda true: replace(true, time=before.last_time + passed * PERIOD), gap=PERIOD + late)
+    jump = rig.now - before.receipt_time - passed * PERIOD
     assert (fault != Fault.STALE) == is_jump
     assert not is_jump or rig.state.last_offset == pytest.approx(before.last_offset + jump, abs=1e-4)
 
