@@ -238,7 +238,7 @@ def test_damping_torque_multiplies_the_velocity_by_its_decay():
         (0.2, 0.4, 0.05, False),
         (0.2001, 0.4, 1.0, True),
         (0.0499, 0.06, 1.0, False),  # slow enough, although more than half of the initial speed
-        (0.0501, 0.06, 1.0, True),
+        (0.05002, 0.06, 1.0, True),
         (0.05, 0.06, 1.0, False),
         (np.nan, 0.4, 1.0, False),
     ],
