@@ -263,6 +263,15 @@ def test_jump_of_the_local_clock_is_what_the_robots_clock_lacks(passed, late, is
     assert not is_jump or rig.state.last_offset == pytest.approx(before.last_offset + jump, abs=1e-4)
 
 
+@pytest.mark.parametrize(("late", "is_jump"), [(8.0, False), (8.004, True)])
+def test_delay_up_to_the_maximum_age_is_no_jump_of_the_local_clock(late, is_jump):
+    rig = Rig(limits=replace(LIMITS, max_age=8 * PERIOD, max_check_interval=4 * PERIOD)).settle()
+    before = rig.state
+    fault = rig.check(lambda true: replace(true, time=before.last_time + PERIOD), gap=(1.0 + late) * PERIOD)
+    assert fault == Fault.DEADLINE_MISSED
+    assert (rig.state.last_offset - before.last_offset > 4 * PERIOD) == is_jump
+
+
 def test_late_message_is_no_jump_of_the_local_clock():
     rig = Rig().settle()
     late = rig.state.last_time + PERIOD
