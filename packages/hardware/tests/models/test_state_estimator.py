@@ -1106,6 +1106,27 @@ def test_larger_torques_than_commanded_are_a_fault(scale, is_detected):
     assert (fault == Fault.NOT_REACTING) == is_detected
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("share", "is_excessive"), [(0.9995, False), (1.0005, True)])
+def test_impulse_is_compared_with_the_commanded_one_at_its_tolerance(joint, sign, share, is_excessive):
+    rig = Rig().settle()
+    for _ in range(3):
+        rig.check(torque=rig.balance + [8.0, -6.0])
+    before = rig.state
+    external, torque = before.external, before.torque
+    net = torque + external - DAMPING * before.velocity + before.bias
+    error = np.array(TOLERANCE) + module.MODEL_ERROR * np.abs(net) + module.SENSOR_ERROR * np.abs(external)
+    largest = np.maximum(PERIOD * np.abs(torque), np.exp(-PERIOD / module.PULSE_WINDOW) * before.largest_pulse)
+    allowed = (1.0 + module.MAX_SCALE_ERROR) * largest + PERIOD * error + np.abs(M) @ np.full(2, LIMITS.velocity_noise)
+    impulse = PERIOD * (net - torque) + sign * share * allowed * np.eye(2)[joint]
+    positions, velocities = np.split(before.last_values, 3)[:2]
+    change = np.linalg.solve(M, impulse)
+    moved = PERIOD * (velocities + 0.5 * change)
+    rig.check(lambda true: replace(true, positions=positions + moved, velocities=velocities + change))
+    assert (rig.state.excess[joint] > before.excess[joint]) == is_excessive
+
+
 def test_collision_is_no_larger_torque_than_commanded():
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     for step in range(100):
