@@ -76,7 +76,7 @@ def test_environment_passes_the_checkers_without_a_warning(guidance, options, mo
 @pytest.mark.parametrize("guidance", GUIDANCE)
 def test_zero_action_succeeds_and_crosses_the_obstacle(guidance):
     env = make(guidance)
-    rewards, _, infos = play(env, zero_action, seed=0)
+    rewards, _, infos = play(env, lambda _: np.zeros(env.action_space.shape, np.float32), seed=0)
     assert not infos[0]["fallback"]
     assert {"is_success", "termination", "control_steps", "fallback"} <= set(infos[-1])
     assert infos[-1]["control_steps"] == len(env.trace)
