@@ -1086,6 +1086,28 @@ def test_other_clock_is_adopted_only_at_rest_in_the_posture(velocity, offset, is
     assert (rig.estimate.fault == Fault.NONE, rig.estimate.is_new) == (is_adopted, is_adopted)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("share", "is_adopted"), [(0.999, True), (1.001, False)])
+def test_other_clock_is_adopted_up_to_the_source_speed(joint, share, is_adopted):
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    velocity, start = share * module.SOURCE_SPEED * np.eye(2)[joint], rig.step
+
+    def other(true):
+        positions = true.positions + velocity * PERIOD * (rig.step - start)
+        return replace(true, time=true.time - 1.0, velocities=true.velocities + velocity, positions=positions)
+
+    for _ in range(SETTLED + round(module.SOURCE_TIME / PERIOD)):
+        rig.check(other, torque=np.zeros(2))
+    assert (rig.estimate.fault == Fault.NONE) == is_adopted
+
+
+def test_excess_is_forgotten_without_torque():
+    rig = Rig().settle()
+    rig.state = rig.state._replace(excess=np.full(2, 0.2), torque=np.zeros(2))
+    rig.check(torque=np.zeros(2))
+    np.testing.assert_array_equal(rig.state.excess, 0.0)
+
+
 def test_fault_persists_while_two_clocks_alternate_slowly():
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     rig.check(shifted(time=-1.0), torque=np.zeros(2))
