@@ -1066,11 +1066,14 @@ def test_accepted_status_is_compared_with_the_last_status():
 
 @pytest.mark.parametrize(
     ("velocity", "offset", "is_adopted"),
-    [((0.0, 0.0), 0.0, True), ((0.0, 0.0), 0.2, False), ((0.1, 0.0), 0.0, False)],
+    [((0.0, 0.0), 0.0, True), ((0.0, 0.0), 0.2, False), ((0.0, 0.0), -0.2, False), ((0.1, 0.0), 0.0, False)],
 )
 def test_other_clock_is_adopted_only_at_rest_in_the_posture(velocity, offset, is_adopted):
     """Its velocity would be damped, and its state followed after `resume`."""
-    rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
+    rig = Rig(velocity=np.zeros(2), external=np.zeros(2))
+    rig.q = np.array([0.7, -0.4])
+    for _ in range(SETTLED):
+        rig.check(torque=np.zeros(2))
     before = rig.accepted
 
     def other(true):
@@ -1087,7 +1090,7 @@ def test_other_clock_is_adopted_only_at_rest_in_the_posture(velocity, offset, is
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-@pytest.mark.parametrize(("share", "is_adopted"), [(0.9995, True), (1.0005, False)])
+@pytest.mark.parametrize(("share", "is_adopted"), [(0.9995, True), (1.0005, False), (-0.9995, True), (-1.0005, False)])
 def test_other_clock_is_adopted_up_to_the_source_speed(joint, share, is_adopted):
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     velocity, start = share * module.SOURCE_SPEED * np.eye(2)[joint], rig.step
