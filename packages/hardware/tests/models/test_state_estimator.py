@@ -605,6 +605,21 @@ def test_drift_is_detected_while_velocities_change(rate, is_late):
     assert not rate or count * PERIOD < 1.0
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("excess", "is_fault"), [(0.9995, False), (1.0005, True)])
+@pytest.mark.parametrize("is_lagging", [True, False])
+def test_drift_is_checked_at_its_tolerance(joint, sign, excess, is_fault, is_lagging):
+    """A drift up to the effect of a velocity filter with a delay of one period is none, in its direction only."""
+    rig, decay = Rig().settle(), np.exp(-PERIOD / module.DRIFT_WINDOW)
+    swing = 0.8
+    limit = excess * module.MAX_DRIFT * LIMITS.position_tolerance
+    drift = module.LAG * PERIOD * swing + limit if is_lagging else -limit
+    unit = sign * np.eye(2)[joint] / decay
+    rig.state = rig.state._replace(drift=drift * unit, swing=swing * unit)
+    assert rig.check() == (Fault.INCONSISTENT if is_fault else Fault.NONE)
+
+
 def test_noise_is_no_drift():
     rng, rig = np.random.default_rng(0), Rig().settle()
     for _ in range(round(6.0 / PERIOD)):
@@ -1066,7 +1081,8 @@ def test_accepted_status_is_compared_with_the_last_status():
 
 @pytest.mark.parametrize(
     ("velocity", "offset", "is_adopted"),
-    [((0.0, 0.0), 0.0, True), ((0.0, 0.0), 0.2, False), ((0.0, 0.0), -0.2, False), ((0.1, 0.0), 0.0, False)],
+    [((0.0, 0.0), 0.0, True), ((0.0, 0.0), -0.2, False), ((0.1, 0.0), 0.0, False)]
+    + [((0.0, 0.0), 0.9995 * module.SOURCE_DISTANCE, True), ((0.0, 0.0), 1.0005 * module.SOURCE_DISTANCE, False)],
 )
 def test_other_clock_is_adopted_only_at_rest_in_the_posture(velocity, offset, is_adopted):
     """Its velocity would be damped, and its state followed after `resume`."""
@@ -1102,6 +1118,14 @@ def test_other_clock_is_adopted_up_to_the_source_speed(joint, share, is_adopted)
     for _ in range(SETTLED + round(module.SOURCE_TIME / PERIOD)):
         rig.check(other, torque=np.zeros(2))
     assert (rig.estimate.fault == Fault.NONE) == is_adopted
+
+
+@pytest.mark.parametrize(("share", "is_over"), [(1.0, False), (1.0005, True)])
+def test_doubt_of_the_source_ends_after_the_source_time(share, is_over):
+    rig = Rig().settle()
+    rig.state = rig.state._replace(source_time=rig.now + PERIOD - share * module.SOURCE_TIME)
+    rig.check()
+    assert np.isnan(rig.state.source_time) == is_over
 
 
 def test_excess_is_forgotten_without_torque():
