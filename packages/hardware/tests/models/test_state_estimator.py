@@ -1128,6 +1128,14 @@ def test_doubt_of_the_source_ends_after_the_source_time(share, is_over):
     assert np.isnan(rig.state.source_time) == is_over
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("share", "fault"), [(0.9995, Fault.NONE), (1.0005, Fault.NOT_REACTING)])
+def test_share_of_larger_impulses_is_checked_at_its_limit(joint, share, fault):
+    rig, decay = Rig().settle(), np.exp(-PERIOD / module.SCALE_WINDOW)
+    rig.state = rig.state._replace(excess=share * module.MAX_EXCESS / decay * np.eye(2)[joint])
+    assert rig.check() == fault
+
+
 def test_excess_is_forgotten_without_torque():
     rig = Rig().settle()
     rig.state = rig.state._replace(excess=np.full(2, 0.2), torque=np.zeros(2))
