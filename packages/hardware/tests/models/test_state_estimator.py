@@ -1165,7 +1165,7 @@ def test_larger_torques_than_commanded_are_a_fault(scale, is_detected):
 
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("share", "is_excessive"), [(0.9995, False), (1.0005, True)])
+@pytest.mark.parametrize(("share", "is_excessive"), [(0.9999, False), (1.0001, True)])
 @pytest.mark.parametrize("coupling", [0.25, -0.25])
 def test_impulse_is_compared_with_the_commanded_one_at_its_tolerance(
     joint, sign, share, is_excessive, coupling, monkeypatch
