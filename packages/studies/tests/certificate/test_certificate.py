@@ -854,3 +854,11 @@ def test_checker_accepts_altered_fields_only_with_valid_claims(history, tmp_path
         assert has_valid_claims(altered, contents, result), name
     assert num_altered >= 100
     assert num_accepted <= 0.1 * num_altered
+
+
+def test_tolerances_of_the_checker_have_their_documented_values():
+    """A wider tolerance would accept more claims; the other tests show false claims far beyond it only."""
+    assert (checker.AGREEMENT, checker.BORDER, checker.COMMAND_TOLERANCE, checker.ROUNDING) == (1e-4, 1e-5, 1e-9, 1e-6)
+    assert (checker.getcontext().prec, checker.DECIMAL, checker.EPS) == (60, 1e-59, np.finfo(float).eps)
+    assert (checker.SMALLEST, checker.LARGEST, checker.UNDERFLOW) == (1e-40, 1e40, 1e-60)
+    assert (checker.MAX_BYTES, checker.MAX_WINDOW) == (2**30, 500)
