@@ -6,7 +6,7 @@ This guidance is KGRL with a single action, which displaces the motion along one
 import numpy as np
 from pydantic import Field
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
+from pydrake.systems.primitives import MatrixGain, ZeroOrderHold
 
 from guiderail import Options, PriorKnowledge, make_env, register_guidance
 from guiderail.diagrams.guidance.guidance import Guidance
@@ -30,12 +30,10 @@ class KgrlAlong(Guidance):
         kgrl = builder.AddNamedSystem("kgrl", PrimitiveGuidance(known))
         direction = MatrixGain(D=np.array([[np.cos(angle)], [np.sin(angle)]]))
         builder.AddNamedSystem("direction", direction)
-        action = builder.AddNamedSystem("action", PassThrough(1))
         held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, 1))
-        for system in (direction, held):
-            builder.Connect(action.get_output_port(), system.get_input_port())
+        builder.ExportInput(direction.get_input_port(), "action")
+        builder.ConnectInput("action", held.get_input_port())
         builder.Connect(direction.get_output_port(), kgrl.get_action_input_port())
-        builder.ExportInput(action.get_input_port(), "action")
         builder.ExportInput(kgrl.get_pose_input_port(), "pose")
         builder.ExportInput(kgrl.get_wrench_input_port(), "wrench")
         builder.ExportOutput(held.get_output_port(), "held_action")

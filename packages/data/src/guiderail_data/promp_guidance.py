@@ -2,7 +2,7 @@
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
-from pydrake.systems.primitives import PassThrough, ZeroOrderHold
+from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import RESIDUAL, PrimitiveGuidance, primitive_config_of
@@ -67,13 +67,12 @@ class PrompGuidance(Guidance):
         residual = builder.AddNamedSystem("residual", PrimitiveGuidance(prior, **RESIDUAL))
         motion = WeightedBasis(config.num_actions, config.reference.num_steps, config.control_period)
         builder.AddNamedSystem("weighted_basis", motion)
-        size = motion.get_weights_input_port().size()
-        action = builder.AddNamedSystem("action", PassThrough(size))
-        held = builder.AddNamedSystem("held_action", ZeroOrderHold(config.control_period, size))
-        for system in (motion, held):
-            builder.Connect(action.get_output_port(), system.get_input_port())
+        held = builder.AddNamedSystem(
+            "held_action", ZeroOrderHold(config.control_period, motion.get_weights_input_port().size())
+        )
+        builder.ExportInput(motion.get_weights_input_port(), "action")
+        builder.ConnectInput("action", held.get_input_port())
         builder.Connect(motion.get_displacement_output_port(), residual.get_action_input_port())
-        builder.ExportInput(action.get_input_port(), "action")
         builder.ExportInput(residual.get_pose_input_port(), "pose")
         builder.ExportInput(residual.get_wrench_input_port(), "wrench")
         builder.ExportOutput(held.get_output_port(), "held_action")
