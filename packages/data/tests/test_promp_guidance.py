@@ -5,6 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
+from guiderail.models.common.errors import InputError
 from guiderail_data.promp import basis
 from guiderail_data.promp_guidance import NUM_BASIS, WeightedBasis
 
@@ -22,6 +23,12 @@ def test_displacement_is_the_weighted_sum_of_the_basis_functions(time, phase):
     bumps = np.exp(-0.5 * (2.0 * (phase - np.array([0.0, 0.5, 1.0]))) ** 2)
     first = (bumps[0] - bumps[2]) / bumps.sum()
     np.testing.assert_allclose(system.get_displacement_output_port().Eval(context), [first, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize("numbers", [(1, 2), (11, 1), (11, 12)])
+def test_numbers_of_steps_and_basis_functions_are_checked(numbers):
+    with pytest.raises(InputError, match="must be a whole number (of at least|from) 2"):
+        WeightedBasis(2, numbers[0], PERIOD, num_basis=numbers[1])
 
 
 def test_one_action_displaces_the_whole_motion():

@@ -8,6 +8,7 @@ from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import RESIDUAL, PrimitiveGuidance, primitive_config_of
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.models.common.arrays import as_whole
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail_data.promp import basis
@@ -27,10 +28,14 @@ class WeightedBasis(LeafSystem):
         num_steps: Number of control steps of the motion, at least 2.
         period: Control period [s], positive.
         num_basis: Number K of basis functions, at least 2.
+
+    Raises:
+        InputError: If a number or the period is out of range.
     """
 
     def __init__(self, num_outputs: int, num_steps: int, period: float, num_basis: int = NUM_BASIS):
         super().__init__()
+        num_basis = as_whole(num_basis, "num_basis", 2, as_whole(num_steps, "num_steps", 2))
         self._shape, self._period = (num_outputs, num_basis), period
         self._basis = basis(np.linspace(0.0, 1.0, num_steps), num_basis)
         self._weights_port = self.DeclareVectorInputPort("weights", num_outputs * num_basis)
