@@ -27,7 +27,7 @@ def test_displacement_is_the_weighted_sum_of_the_basis_functions(time, phase):
 
 @pytest.mark.parametrize("numbers", [(1, 2), (11, 1), (11, 12)])
 def test_numbers_of_steps_and_basis_functions_are_checked(numbers):
-    with pytest.raises(InputError, match="must be a whole number (of at least|from) 2"):
+    with pytest.raises(InputError, match=r"must be a whole number (of at least|from) 2"):
         WeightedBasis(2, numbers[0], PERIOD, num_basis=numbers[1])
 
 
